@@ -1,0 +1,34 @@
+"""Belief models and the environments over them (paper, Sections II and VI)."""
+
+from torchrl_pomdp.envs.belief import BeliefEnv, BeliefModel, StateGenerator
+from torchrl_pomdp.envs.generators import CalibratedStart, FixedBelief, InPart, RandomState, UniformStart
+from torchrl_pomdp.envs.graphs import Graph, grid, line
+from torchrl_pomdp.envs.partition import Partition, RepairPartition, SinglePart
+from torchrl_pomdp.envs.presets import PRESETS, Problem, make_problem
+from torchrl_pomdp.envs.repair import REPAIR, RepairModel, damage_chain
+from torchrl_pomdp.envs.tabular import TabularModel, tiger
+
+__all__ = [
+    "PRESETS",
+    "REPAIR",
+    "BeliefEnv",
+    "BeliefModel",
+    "CalibratedStart",
+    "FixedBelief",
+    "Graph",
+    "InPart",
+    "Partition",
+    "Problem",
+    "RandomState",
+    "RepairModel",
+    "RepairPartition",
+    "SinglePart",
+    "StateGenerator",
+    "TabularModel",
+    "UniformStart",
+    "damage_chain",
+    "grid",
+    "line",
+    "make_problem",
+    "tiger",
+]

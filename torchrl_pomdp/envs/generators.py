@@ -1,0 +1,222 @@
+"""Distributions of feature states, as pure functions of 64-bit keys.
+
+A generator maps int64 keys ``[*B]`` to feature states ``[*B]``; the same key gives the same state in any batch. They make
+the starts of environments and evaluations and the training states of each part (paper, Section VI-C).
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
+from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.noise import fold, uniform
+
+__all__ = ["CalibratedStart", "FixedBelief", "InPart", "RandomState", "UniformStart"]
+
+# What a key's independent streams of uniforms are for.
+_ORDER, _LEVELS, _ROBOTS, _OBSERVE, _FRACTION, _AGE, _RETRY = range(7)
+
+
+class UniformStart:
+    """Every level equally likely at every location, robots at given locations: the prior of the small exact problems.
+
+    Args:
+        model: the repair model.
+        robots: location of each robot.
+        observe_start: whether the robots observe their locations before the first control.
+
+    Raises:
+        ValueError: if ``robots`` does not give one location for each robot.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> make_problem("line3").start(torch.arange(4))["belief"].shape
+        torch.Size([4, 3, 5])
+    """
+
+    def __init__(self, model: RepairModel, robots: tuple[int, ...] = (0,), *, observe_start: bool = True) -> None:
+        if len(robots) != model.num_robots or not all(0 <= place < model.num_locations for place in robots):
+            raise ValueError(
+                f"robots must be {model.num_robots} locations in 0..{model.num_locations - 1}, got {tuple(robots)}"
+            )
+        self.model, self.robots, self.observe_start = model, tuple(robots), observe_start
+
+    def __call__(self, keys: Tensor) -> TensorDictBase:
+        """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
+        model = self.model
+        shape = (*keys.shape, model.num_locations, model.num_levels)
+        belief = torch.full(shape, 1.0 / model.num_levels, dtype=model.dtype, device=keys.device)
+        location = torch.tensor(self.robots, device=keys.device).expand(*keys.shape, -1).clone()
+        return _place(model, keys, belief, location, self.observe_start)
+
+
+class CalibratedStart:
+    """The calibrated start states: a fraction of the locations possibly damaged, robots anywhere.
+
+    The belief of a possibly damaged location is Dirichlet(1, …, 1) over the levels, the others are surely at level 0.
+
+    Args:
+        model: the repair model.
+        damaged_fraction: fraction of the locations that are possibly damaged, in (0, 1]; their number is rounded.
+        observe_start: whether the robots observe their locations before the first control.
+
+    Raises:
+        ValueError: if ``damaged_fraction`` is not in (0, 1].
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> problem = make_problem("linear20")
+        >>> y = CalibratedStart(problem.model, observe_start=False)(torch.arange(100))
+        >>> (y["belief"][..., 0] < 1).sum(-1).unique().tolist()
+        [14]
+    """
+
+    def __init__(self, model: RepairModel, damaged_fraction: float = 0.7, *, observe_start: bool = True) -> None:
+        if not 0.0 < damaged_fraction <= 1.0:
+            raise ValueError(f"damaged_fraction must be in (0, 1], got {damaged_fraction}")
+        self.model, self.observe_start = model, observe_start
+        self.num_damaged = max(1, round(damaged_fraction * model.num_locations))
+
+    def __call__(self, keys: Tensor) -> TensorDictBase:
+        """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
+        belief = _random_beliefs(self.model, keys, torch.full_like(keys, self.num_damaged))
+        return _place(self.model, keys, belief, _anywhere(self.model, keys), self.observe_start)
+
+
+class RandomState:
+    """Random feature states of a phase, for training (paper, Section VI-C, "random generation of feature states").
+
+    The number of possibly damaged locations is uniform between two fractions, each belief is Dirichlet(1, …, 1) and has
+    then degraded for a random number of stages; the robots are anywhere and have observed their locations.
+
+    Args:
+        model: the repair model.
+        fractions: lowest and highest fraction of possibly damaged locations, 0 <= low <= high <= 1.
+        max_age: largest number of stages the beliefs have degraded.
+
+    Raises:
+        ValueError: if the fractions are not ordered in [0, 1] or ``max_age`` is negative.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> model = make_problem("linear20").model
+        >>> y = RandomState(model, fractions=(0.0, 0.45))(torch.arange(100))
+        >>> int(model.partition(y).min())
+        3
+    """
+
+    def __init__(self, model: RepairModel, fractions: tuple[float, float] = (0.0, 1.0), max_age: int = 40) -> None:
+        low, high = fractions
+        if not 0.0 <= low <= high <= 1.0:
+            raise ValueError(f"fractions must satisfy 0 <= low <= high <= 1, got {fractions}")
+        if max_age < 0:
+            raise ValueError(f"max_age must not be negative, got {max_age}")
+        self.model, self.max_age = model, max_age
+        self.range = max(1, round(low * model.num_locations)), max(1, round(high * model.num_locations))
+        powers = [torch.linalg.matrix_power(model.chain, age) for age in range(max_age + 1)]
+        self._powers = torch.stack(powers)
+
+    def __call__(self, keys: Tensor) -> TensorDictBase:
+        """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
+        low, high = self.range
+        count = low + (_uniforms(keys, _FRACTION, 1).squeeze(-1) * (high - low + 1)).to(torch.int64)
+        age = (_uniforms(keys, _AGE, 1).squeeze(-1) * (self.max_age + 1)).to(torch.int64)
+        belief = _random_beliefs(self.model, keys, count) @ self._powers[age]
+        return _place(self.model, keys, belief, _anywhere(self.model, keys), observe=True)
+
+
+class InPart:
+    """A generator restricted to one part of the model's partition, by rejection.
+
+    Args:
+        model: a model with a partition.
+        proposal: generator of candidate states.
+        part: the part that states must lie in.
+        max_tries: candidates for one state before giving up.
+
+    Raises:
+        ValueError: if ``part`` is not a part of the model's partition; when called, if a state has no acceptable
+            candidate among ``max_tries``.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> model = make_problem("linear20").model
+        >>> y = InPart(model, RandomState(model), part=2)(torch.arange(50))
+        >>> model.partition(y).unique().tolist()
+        [2]
+    """
+
+    def __init__(self, model: BeliefModel, proposal: StateGenerator, part: int, max_tries: int = 500) -> None:
+        if model.partition is None or not 0 <= part < model.partition.num_parts:
+            parts = 0 if model.partition is None else model.partition.num_parts
+            raise ValueError(f"part must be one of the model's {parts} parts, got {part}")
+        self.model, self.proposal, self.part, self.max_tries = model, proposal, part, max_tries
+
+    def __call__(self, keys: Tensor) -> TensorDictBase:
+        """Feature states ``[*B]`` of the part for int64 keys ``[*B]``; terminal states are rejected too."""
+        assert self.model.partition is not None
+        flat = keys.reshape(-1)
+        result = self.proposal(flat)
+        missing = torch.arange(flat.numel(), device=keys.device)
+        candidate = result
+        for attempt in range(self.max_tries):
+            accepted = (self.model.partition(candidate) == self.part) & ~self.model.is_terminal(candidate)
+            result[missing[accepted]] = candidate[accepted]
+            missing = missing[~accepted]
+            if missing.numel() == 0:
+                return result.view(keys.shape)
+            candidate = self.proposal(fold(fold(flat[missing], _RETRY), attempt))
+        raise ValueError(
+            f"no state of part {self.part} ({self.model.partition.names[self.part]}) among {self.max_tries} candidates "
+            f"of {type(self.proposal).__name__}: choose a proposal that reaches it"
+        )
+
+
+class FixedBelief:
+    """A single start belief of a tabular model.
+
+    Args:
+        belief: probabilities of the states, ``[n]``.
+
+    Examples:
+        >>> FixedBelief(torch.tensor([0.5, 0.5]))(torch.arange(3))["belief"].shape
+        torch.Size([3, 2])
+    """
+
+    def __init__(self, belief: Tensor) -> None:
+        self.belief = belief
+
+    def __call__(self, keys: Tensor) -> TensorDictBase:
+        """Feature states ``[*B]`` for int64 keys ``[*B]``."""
+        return TensorDict({"belief": self.belief.expand(*keys.shape, -1).clone()}, batch_size=keys.shape)
+
+
+def _uniforms(keys: Tensor, purpose: int, count: int) -> Tensor:
+    """``count`` uniforms ``[*B, count]`` of each key's stream for one purpose."""
+    return uniform(fold(keys, purpose).unsqueeze(-1), torch.arange(count, device=keys.device))
+
+
+def _anywhere(model: RepairModel, keys: Tensor) -> Tensor:
+    """Uniform locations of the robots, ``[*B, R]``."""
+    return (_uniforms(keys, _ROBOTS, model.num_robots) * model.num_locations).to(torch.int64)
+
+
+def _random_beliefs(model: RepairModel, keys: Tensor, num_damaged: Tensor) -> Tensor:
+    """Beliefs ``[*B, L, K]``: ``num_damaged`` ``[*B]`` random locations are Dirichlet(1, …, 1), the others at level 0."""
+    size, levels = model.num_locations, model.num_levels
+    place = _uniforms(keys, _ORDER, size).argsort(-1).argsort(-1)
+    damaged = (place < num_damaged.unsqueeze(-1)).unsqueeze(-1)
+    # Normalised exponentials are Dirichlet(1, …, 1); log1p(-u) is finite for u in [0, 1).
+    weight = -torch.log1p(-_uniforms(keys, _LEVELS, size * levels).double()).view(*keys.shape, size, levels)
+    weight = weight.clamp_min(2.0**-30)
+    intact = torch.eye(levels, dtype=weight.dtype, device=keys.device)[0]
+    return torch.where(damaged, weight / weight.sum(-1, keepdim=True), intact).to(model.dtype)
+
+
+def _place(model: RepairModel, keys: Tensor, belief: Tensor, location: Tensor, observe: bool) -> TensorDictBase:
+    """Feature states of beliefs and locations, the robots having observed if ``observe``."""
+    y = TensorDict({"belief": belief, "location": location}, batch_size=keys.shape, device=model.device)
+    return model.observe(y, _uniforms(keys, _OBSERVE, model.num_robots)) if observe else y

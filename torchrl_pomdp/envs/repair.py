@@ -1,0 +1,368 @@
+r"""The sequential repair problem with its exact factored belief (paper, Section VI-A), for any graph and any robots.
+
+One stage, in this order: (1) the cost of all locations, on the state before the control; (2) every robot repairs its own
+location or moves to a neighbour; (3) every location that is not just repaired takes one step of the damage chain;
+(4) every robot observes exactly the level of the location where it now stands.
+
+Locations stay independent given the history, so the belief is a product of marginals, ``belief[..., l, k]`` = P(level of
+location l is k), updated in closed form. Inside, beliefs are planes ``[K, L, N]`` with the batch innermost: a step is a few
+elementwise passes over contiguous memory. What callers see is a ``[*B, L, K]`` view of these planes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite
+
+from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf
+from torchrl_pomdp.envs.graphs import Graph
+from torchrl_pomdp.envs.partition import Partition
+
+__all__ = ["REPAIR", "RepairModel", "damage_chain"]
+
+REPAIR = 0
+"""A robot's control *repair*; control ``1 + s`` moves along slot ``s`` of the graph."""
+
+
+def damage_chain(degradation: tuple[float, ...]) -> Tensor:
+    r"""The paper's damage chain: level k rises to k+1 with probability :math:`\gamma_k`, the last level is absorbing.
+
+    Args:
+        degradation: :math:`\gamma_0,\dots,\gamma_{\zeta-1}`, each in [0, 1].
+
+    Returns:
+        row-stochastic matrix ``[K, K]``, K = len(degradation) + 1.
+
+    Raises:
+        ValueError: if a probability is outside [0, 1].
+
+    Examples:
+        >>> damage_chain((0.0, 0.25)).tolist()
+        [[1.0, 0.0, 0.0], [0.0, 0.75, 0.25], [0.0, 0.0, 1.0]]
+    """
+    if not degradation or not all(0.0 <= p <= 1.0 for p in degradation):
+        raise ValueError(f"degradation must hold probabilities in [0, 1], at least one, got {degradation}")
+    rise = torch.tensor(degradation, dtype=torch.float64)
+    return torch.diag(torch.cat([1.0 - rise, rise.new_ones(1)])) + torch.diag(rise, 1)
+
+
+class RepairModel(BeliefModel):
+    r"""Belief model of the repair problem: L locations with K damage levels, R robots.
+
+    Core entries: ``"belief"`` float ``[*B, L, K]`` and ``"location"`` int64 ``[*B, R]``. The joint control is the number
+    whose base-A digits are the robots' controls, robot 0 first; the joint observation has base-K digits likewise.
+
+    A robot may not leave the graph; it may repair a location known to be at level 0 only where no move is possible. States
+    with P(any damage) <= ``terminal_probability`` are terminal if level 0 is absorbing.
+
+    Args:
+        graph: where the robots move.
+        chain: row-stochastic matrix ``[K, K]`` of the damage levels, see :func:`damage_chain`.
+        costs: cost of a location per stage at each level, ``[K]``, finite and nonnegative.
+        discount: :math:`\alpha`.
+
+    Keyword Args:
+        num_robots: R, at least 1.
+        terminal_probability: :math:`\epsilon`, in [0, 1).
+        partition: partition whose index becomes a feature.
+        dtype: float32 or float64.
+        device: where the model computes.
+
+    Raises:
+        ValueError: if an argument is out of range; the message names it.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import line
+        >>> model = RepairModel(line(20), damage_chain((0, 0.02, 0.03, 0.05)), (0, 0.1, 1, 10, 100), 0.99)
+        >>> model.describe()
+        'line of 20, 1 robot: 1.9e+15 states, 3 controls, 5 observations, discount 0.99'
+    """
+
+    chain: Tensor
+    costs: Tensor
+    destinations: Tensor
+    first_controls: Tensor
+
+    def __init__(
+        self,
+        graph: Graph,
+        chain: Tensor,
+        costs: Tensor | tuple[float, ...],
+        discount: float,
+        *,
+        num_robots: int = 1,
+        terminal_probability: float = 1e-6,
+        partition: Partition | None = None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(discount, partition)
+        chain, costs = torch.as_tensor(chain), torch.as_tensor(costs)
+        _check_chain(chain)
+        _check_costs(costs, chain.shape[0])
+        if num_robots < 1:
+            raise ValueError(f"num_robots must be at least 1, got {num_robots}")
+        if not 0.0 <= terminal_probability < 1.0:
+            raise ValueError(f"terminal_probability must be in [0, 1), got {terminal_probability}")
+        self.graph = graph
+        self.num_locations, self.num_levels, self.num_robots = graph.num_locations, chain.shape[0], num_robots
+        self.num_robot_controls = len(graph.control_names)
+        self.num_controls = self.num_robot_controls**num_robots
+        self.num_observations = self.num_levels**num_robots
+        self.noise_dim = num_robots
+        self.terminal_probability = terminal_probability
+        self.level_zero_absorbing = bool(chain[0, 0] == 1)
+        self._register_tables(chain.to(dtype), costs.to(dtype), torch.device(device))
+
+    def _register_tables(self, chain: Tensor, costs: Tensor, device: torch.device) -> None:
+        nodes = torch.arange(self.num_locations).unsqueeze(-1)
+        destinations = torch.cat([nodes, self.graph.neighbours], -1)
+        tables = {
+            "chain": chain,
+            "costs": costs,
+            # [L, A]: location after a robot's control, -1 where the move leaves the graph.
+            "destinations": destinations,
+            "first_controls": self.graph.first_controls,
+            # [1, K L]: stage cost of flattened planes.
+            "_cost_row": costs.repeat_interleave(self.num_locations).unsqueeze(0),
+            "_levels": torch.arange(self.num_levels).unsqueeze(-1),
+        }
+        for name, value in tables.items():
+            self.register_buffer(name, value.to(device), persistent=False)
+        self._stay = self.chain.diagonal().view(-1, 1, 1)
+        self._diagonals = list(_off_diagonals(self.chain))
+
+    # ---- specs and descriptions ----------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the model's tensors."""
+        return self.chain.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating type of beliefs and costs."""
+        return self.chain.dtype
+
+    @property
+    def num_states(self) -> int:
+        """Size of the underlying state space, L^R K^L."""
+        return self.num_locations**self.num_robots * self.num_levels**self.num_locations
+
+    def state_spec(self, batch_size: torch.Size | tuple[int, ...] = ()) -> Composite:
+        """``belief`` ``[*B, L, K]`` in [0, 1] and ``location`` ``[*B, R]``."""
+        shape = torch.Size(batch_size)
+        belief = (*shape, self.num_locations, self.num_levels)
+        return Composite(
+            belief=Bounded(0.0, 1.0, shape=belief, dtype=self.dtype, device=self.device),
+            location=Categorical(
+                self.num_locations, shape=(*shape, self.num_robots), dtype=torch.int64, device=self.device
+            ),
+            shape=shape,
+            device=self.device,
+        )
+
+    def describe(self) -> str:
+        """Graph, robots, and the numbers of states, controls and observations."""
+        mantissa, exponent = _scientific(self.num_states)
+        robots = "1 robot" if self.num_robots == 1 else f"{self.num_robots} robots"
+        return (
+            f"{self.graph.name}, {robots}: {mantissa:.1f}e+{exponent:02d} states, {self.num_controls} controls, "
+            f"{self.num_observations} observations, discount {self.discount:g}"
+        )
+
+    # ---- controls ------------------------------------------------------------------------------------------------
+
+    def split_controls(self, u: Tensor) -> Tensor:
+        """Robots' controls ``[*B, R]`` of joint controls ``[*B]``."""
+        return _digits(u, self.num_robot_controls, self.num_robots)
+
+    def join_controls(self, controls: Tensor) -> Tensor:
+        """Joint controls ``[*B]`` of robots' controls ``[*B, R]``."""
+        joint = controls[..., 0]
+        for robot in range(1, self.num_robots):
+            joint = joint * self.num_robot_controls + controls[..., robot]
+        return joint
+
+    def action_mask(self, y: TensorDictBase) -> Tensor:
+        """Legal joint controls, bool ``[*B, U]``: every robot's control is legal for it."""
+        belief, location = y.get("belief"), y.get("location")
+        moves = self.destinations[location][..., 1:] >= 0
+        intact = belief[..., 0].gather(-1, location) >= 1.0
+        repair = ~(intact & moves.any(-1))
+        robots = torch.cat([repair.unsqueeze(-1), moves], -1)
+        mask = robots[..., 0, :]
+        for robot in range(1, self.num_robots):
+            mask = (mask.unsqueeze(-1) & robots[..., robot, :].unsqueeze(-2)).flatten(-2)
+        return mask
+
+    # ---- the model -----------------------------------------------------------------------------------------------
+
+    def expected_cost(self, y: TensorDictBase, u: Tensor | None = None) -> Tensor:
+        """Sum over locations of belief times cost, ``[*B]``; it does not depend on the control."""
+        return self._stage_cost(self._planes(y)).view(y.batch_size)
+
+    def is_terminal(self, y: TensorDictBase) -> Tensor:
+        """Bool ``[*B]``: P(any damage) <= ``terminal_probability``; never where level 0 is not absorbing."""
+        if not self.level_zero_absorbing:
+            return torch.zeros(y.batch_size, dtype=torch.bool, device=self.device)
+        intact = self._planes(y)[0].prod(0)
+        return (1.0 - intact <= self.terminal_probability).view(y.batch_size)
+
+    def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
+        """Joint distribution of the robots' observed levels, ``[*B, K^R]``."""
+        planes, location, repaired = self._transition(y, u)
+        for robot in range(self.num_robots):
+            # A repaired location is at level 0 for every robot that stands there; a repairing robot has not moved.
+            levels = self._levels_at(planes, location[robot])
+            intact = (self._levels == 0).to(self.dtype)
+            self._put(planes, location[robot], torch.where(repaired[robot], intact, levels))
+        digits = _digits(torch.arange(self.num_observations, device=self.device), self.num_levels, self.num_robots)
+        joint = torch.ones(self.num_observations, planes.shape[-1], dtype=self.dtype, device=self.device)
+        for robot in range(self.num_robots):
+            factor = self._levels_at(planes, location[robot])[digits[:, robot]]
+            for other in range(robot):
+                # Robots that stand together see the same level: the later one's observation is certain.
+                together = location[robot] == location[other]
+                same = (digits[:, robot] == digits[:, other]).unsqueeze(-1).to(self.dtype)
+                factor = torch.where(together, same, factor)
+            joint = joint * factor
+        return joint.movedim(0, -1).reshape(*y.batch_size, self.num_observations)
+
+    def estimator(self, y: TensorDictBase, u: Tensor, z: Tensor) -> TensorDictBase:
+        """F(y, u, z): degrade, then set the levels observed where the robots now stand (0 after a repair)."""
+        planes, location, _ = self._transition(y, u)
+        levels = _digits(z.reshape(-1), self.num_levels, self.num_robots)
+        for robot in range(self.num_robots):
+            self._set_level(planes, location[robot], levels[:, robot])
+        return self._successor(y, planes, location)
+
+    def advance(self, y: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase]:
+        """One sampled step; robot r observes with ``noise[..., r]``. See :meth:`BeliefModel.advance`."""
+        cost = self._stage_cost(self._planes(y)).view(y.batch_size)
+        planes, location, repaired = self._transition(y, u)
+        self._observe(planes, location, noise, repaired)
+        return cost, self._successor(y, planes, location)
+
+    def observe(self, y: TensorDictBase, noise: Tensor) -> TensorDictBase:
+        """Observe the levels where the robots stand, without a control: for start states.
+
+        Args:
+            y: feature states ``[*B]``.
+            noise: uniforms ``[*B, R]``.
+        """
+        planes, location = self._planes(y).clone(), y.get("location").reshape(-1, self.num_robots).T
+        self._observe(planes, location, noise, torch.zeros_like(location, dtype=torch.bool))
+        return self._successor(y, planes, location)
+
+    def degrade(self, belief: Tensor, steps: int = 1) -> Tensor:
+        """Marginals ``[..., K]`` after ``steps`` steps of the chain without repairs or observations."""
+        return belief @ torch.linalg.matrix_power(self.chain, steps)
+
+    def rows(self, y: TensorDictBase, index: Tensor) -> TensorDictBase:
+        """Rows ``index`` of a flat batch, kept as planes; see :meth:`BeliefModel.rows`."""
+        planes = self._planes(y).flatten(0, 1).index_select(1, index)
+        core = {"belief": planes.view(self.num_levels, self.num_locations, -1).permute(2, 1, 0)}
+        rest = {key: value.index_select(0, index) for key, value in y.items() if key != "belief"}
+        return type(y)({**core, **rest}, batch_size=index.shape, device=self.device)
+
+    # ---- kernels on planes [K, L, N] and locations [R, N] ----------------------------------------------------------
+
+    def _planes(self, y: TensorDictBase) -> Tensor:
+        """Belief of ``y`` as contiguous planes ``[K, L, N]``; free for states that the model made."""
+        belief = y.get("belief").reshape(-1, self.num_locations, self.num_levels)
+        return belief.permute(2, 1, 0).contiguous()
+
+    def _stage_cost(self, planes: Tensor) -> Tensor:
+        # A matrix product sums a column in the same order in any batch, which a reduction over planes does not.
+        return (self._cost_row @ planes.flatten(0, 1)).squeeze(0)
+
+    def _transition(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Degraded planes, and for each robot ``[R, N]`` its new location and whether it repairs there."""
+        origin = y.get("location").reshape(-1, self.num_robots).T
+        controls = _digits(u.reshape(-1), self.num_robot_controls, self.num_robots).T
+        location = self.destinations.flatten()[origin * self.num_robot_controls + controls]
+        return self._degrade_planes(self._planes(y)), location, controls == REPAIR
+
+    def _degrade_planes(self, planes: Tensor) -> Tensor:
+        """One step of the chain in every location: a pass over the planes for each nonzero diagonal."""
+        result = planes * self._stay
+        for source, target, probs in self._diagonals:
+            result[target].addcmul_(planes[source], probs)
+        return result
+
+    def _observe(self, planes: Tensor, location: Tensor, noise: Tensor, repaired: Tensor) -> None:
+        """Draw and set the level at every robot's location, in place; after a repair it is 0."""
+        uniforms = noise.reshape(-1, self.num_robots)
+        for robot in range(self.num_robots):
+            level = inverse_cdf(self._levels_at(planes, location[robot]), uniforms[:, robot], dim=0)
+            self._set_level(planes, location[robot], level.masked_fill(repaired[robot], 0))
+
+    def _set_level(self, planes: Tensor, location: Tensor, level: Tensor) -> None:
+        """Make ``level`` ``[N]`` certain at ``location`` ``[N]``, in place."""
+        self._put(planes, location, (self._levels == level).to(self.dtype))
+
+    def _levels_at(self, planes: Tensor, location: Tensor) -> Tensor:
+        """Marginal ``[K, N]`` of each row's ``location`` ``[N]``."""
+        return planes.flatten(1).index_select(1, self._flat_index(planes, location))
+
+    def _put(self, planes: Tensor, location: Tensor, levels: Tensor) -> None:
+        planes.view(self.num_levels, -1).index_copy_(1, self._flat_index(planes, location), levels)
+
+    def _flat_index(self, planes: Tensor, location: Tensor) -> Tensor:
+        size = planes.shape[-1]
+        return location * size + torch.arange(size, device=planes.device)
+
+    def _successor(self, y: TensorDictBase, planes: Tensor, location: Tensor) -> TensorDictBase:
+        shape = y.batch_size
+        belief = planes.permute(2, 1, 0).reshape(*shape, self.num_locations, self.num_levels)
+        return self.successor(y, belief=belief, location=location.T.reshape(*shape, self.num_robots))
+
+
+def _digits(number: Tensor, base: int, count: int) -> Tensor:
+    """Base-``base`` digits ``[*B, count]`` of ``number`` ``[*B]``, most significant first."""
+    if count == 1:
+        return number.unsqueeze(-1)
+    powers = base ** torch.arange(count - 1, -1, -1, device=number.device)
+    return number.unsqueeze(-1) // powers % base
+
+
+def _off_diagonals(chain: Tensor) -> Iterator[tuple[slice, slice, Tensor]]:
+    """Source levels, target levels and probabilities ``[., 1, 1]`` of the chain's nonzero off-diagonals."""
+    size = chain.shape[0]
+    for offset in range(1 - size, size):
+        probs = chain.diagonal(offset)
+        if offset != 0 and bool((probs != 0).any()):
+            low, high = slice(0, size - abs(offset)), slice(abs(offset), size)
+            source, target = (low, high) if offset > 0 else (high, low)
+            yield source, target, probs.view(-1, 1, 1)
+
+
+def _scientific(number: int) -> tuple[float, int]:
+    """Mantissa and decimal exponent of an integer that may exceed the floats."""
+    exponent = math.floor(math.log10(number))
+    mantissa = round(number / 10**exponent, 1)
+    return (mantissa, exponent) if mantissa < 10 else (1.0, exponent + 1)
+
+
+def _check_chain(chain: Tensor) -> None:
+    if chain.ndim != 2 or chain.shape[0] != chain.shape[1] or chain.shape[0] < 2:
+        raise ValueError(f"chain must be a square matrix of at least 2 levels, got shape {tuple(chain.shape)}")
+    if not bool((chain >= 0).all()):
+        raise ValueError(f"chain must hold nonnegative probabilities, got {chain.tolist()}")
+    sums = chain.double().sum(-1)
+    wrong = ((sums - 1.0).abs() > 1e-6).nonzero().flatten().tolist()
+    if wrong:
+        raise ValueError(f"rows of chain must sum to 1, row {wrong[0]} sums to {float(sums[wrong[0]]):.6g}")
+
+
+def _check_costs(costs: Tensor, num_levels: int) -> None:
+    if costs.shape != (num_levels,):
+        raise ValueError(f"costs must have shape ({num_levels},), one for each level of chain, got {tuple(costs.shape)}")
+    if not bool((torch.isfinite(costs) & (costs >= 0)).all()):
+        raise ValueError(f"costs must be finite and nonnegative, got {costs.tolist()}")

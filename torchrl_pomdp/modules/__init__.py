@@ -1,0 +1,20 @@
+"""Policies, rollout, lookahead and partitioned networks (paper, Sections III to VI)."""
+
+from torchrl_pomdp.modules.base_policies import GreedyRepair
+from torchrl_pomdp.modules.lookahead import RolloutPolicy
+from torchrl_pomdp.modules.networks import Encoder, FlatEncoder, PolicyNetwork, RelativeEncoder
+from torchrl_pomdp.modules.partitioned import PartitionedPolicy
+from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+
+__all__ = [
+    "Encoder",
+    "FlatEncoder",
+    "GreedyRepair",
+    "PartitionedPolicy",
+    "Policy",
+    "PolicyNetwork",
+    "RelativeEncoder",
+    "RolloutPolicy",
+    "TerminalCost",
+    "TruncatedRollout",
+]

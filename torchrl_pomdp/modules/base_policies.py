@@ -1,0 +1,74 @@
+"""Base policies of the repair problem (paper, Section VI-C)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_pomdp.envs.repair import REPAIR, RepairModel
+
+__all__ = ["GreedyRepair"]
+
+
+class GreedyRepair(TensorDictModuleBase):
+    r"""The paper's greedy policy: repair where you stand if it may be damaged, else step to the nearest such location.
+
+    A location may be damaged if :math:`1-b(0)>` ``damage_threshold``. Ties go to the location, then to the control, with
+    the lower index. Several robots choose each for itself. Where nothing may be damaged a robot takes its first move.
+
+    Args:
+        model: the repair model.
+        damage_threshold: probability in [0, 1); zero means any possibility of damage.
+
+    Raises:
+        ValueError: if ``damage_threshold`` is not in [0, 1).
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> problem = make_problem("linear20")
+        >>> y = problem.start(torch.arange(5))
+        >>> GreedyRepair(problem.model)(y)["action"].shape
+        torch.Size([5])
+    """
+
+    in_keys = ["belief", "location"]
+    out_keys = ["action"]
+    ranks: Tensor
+    first_moves: Tensor
+
+    def __init__(self, model: RepairModel, damage_threshold: float = 0.0) -> None:
+        super().__init__()
+        if not 0.0 <= damage_threshold < 1.0:
+            raise ValueError(f"damage_threshold must be in [0, 1), got {damage_threshold}")
+        self.model = model
+        self.damage_threshold = damage_threshold
+        size = model.num_locations
+        # [L, L], target by origin: orders targets by distance, then index, and is below `size * size` for all.
+        ranks = model.graph.distances.T * size + torch.arange(size).unsqueeze(-1)
+        self.register_buffer("ranks", ranks.to(model.device, model.dtype), persistent=False)
+        # [L]: the lowest move of a robot, or repair where it cannot move.
+        legal = model.destinations >= 0
+        legal[:, REPAIR] = ~legal[:, 1:].any(-1)
+        self.register_buffer("first_moves", legal.to(torch.int64).argmax(-1), persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"action"``, int64 ``[*B]``."""
+        size = self.model.num_locations
+        belief = tensordict.get("belief").reshape(-1, size, self.model.num_levels)
+        location = tensordict.get("location").reshape(-1, self.model.num_robots)
+        # 1 where a location is intact, else 0: floor is exact at 1 and much faster than a comparison.
+        intact = (belief[..., 0].T + self.damage_threshold).floor()
+        controls = [self._robot_control(intact, location[:, robot]) for robot in range(self.model.num_robots)]
+        action = self.model.join_controls(torch.stack(controls, -1))
+        return tensordict.set("action", action.view(tensordict.batch_size))
+
+    def _robot_control(self, intact: Tensor, location: Tensor) -> Tensor:
+        """Control ``[N]`` of a robot at ``location`` ``[N]``, given the intact flags ``[L, N]``."""
+        size = self.model.num_locations
+        rank = self.ranks.index_select(1, location).add_(intact, alpha=float(size * size)).amin(0)
+        nowhere = rank >= size * size
+        target = rank.to(torch.int64) % size
+        control = self.model.first_controls.flatten()[location * size + target]
+        return torch.where(nowhere, self.first_moves[location], control)

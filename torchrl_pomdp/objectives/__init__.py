@@ -1,0 +1,5 @@
+"""Losses (paper, Section IV)."""
+
+from torchrl_pomdp.objectives.classification import ClassificationLoss
+
+__all__ = ["ClassificationLoss"]

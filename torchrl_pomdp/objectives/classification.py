@@ -1,0 +1,122 @@
+r"""Training a policy network on rollout controls is a classification problem (paper, Section IV)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+__all__ = ["ClassificationLoss"]
+
+LossName = Literal["l2", "cross_entropy", "cost_weighted"]
+
+
+class ClassificationLoss(LossModule):
+    r"""Loss of a masked policy network against labels :math:`(y^s,u^s)` with Q-factors.
+
+    * ``"l2"``: squared distance of the softmax from the one-hot rollout control, the paper's.
+    * ``"cross_entropy"``: negative log-probability of the rollout control.
+    * ``"cost_weighted"``: the expected gap :math:`\sum_u\pi(u)\,(\tilde Q(y,u)-\min\tilde Q)`, divided by the state's sum
+      of gaps, so that a wrong control matters as much as it costs and no state outweighs the others.
+
+    Args:
+        policy: policy that writes ``"logits"``; a :class:`~torchrl_pomdp.modules.PolicyNetwork` or a partitioned one.
+        loss: one of the names above.
+
+    Returns (by ``forward``):
+        TensorDict with scalars ``loss_policy``, ``accuracy`` (share of states whose label is chosen) and ``regret``
+        (mean gap of the chosen control, a cost).
+
+    Raises:
+        ValueError: if ``loss`` is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import GreedyRepair, FlatEncoder, PolicyNetwork, RolloutPolicy
+        >>> model = make_problem("linear20").model
+        >>> y = make_problem("linear20").start(torch.arange(8))
+        >>> batch = RolloutPolicy(model, GreedyRepair(model))(model.with_features(y))
+        >>> loss = ClassificationLoss(PolicyNetwork(FlatEncoder(model), 3, generator=torch.Generator().manual_seed(0)))
+        >>> bool(loss(batch)["loss_policy"] > 0)
+        True
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        action: NestedKey = "action"
+        q_factors: NestedKey = "q_factors"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_policy", "accuracy", "regret"]
+    policy: TensorDictModuleBase
+    policy_params: TensorDictParams
+    target_policy_params: TensorDictParams
+
+    def __init__(self, policy: TensorDictModuleBase, loss: LossName = "cross_entropy") -> None:
+        super().__init__()
+        if loss not in _LOSSES:
+            raise ValueError(f"loss must be one of {sorted(_LOSSES)}, got {loss!r}")
+        self._in_keys = None
+        self.loss = loss
+        self.convert_to_functional(policy, "policy")
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        pass
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries that ``forward`` reads."""
+        return [*self.policy.in_keys, self.tensor_keys.action, self.tensor_keys.q_factors]
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Loss and metrics of labelled states ``[*B]``; see the class."""
+        batch = tensordict.reshape(-1)
+        with self.policy_params.to_module(self.policy, preserve_module_state=False):
+            output = self.policy(batch.select(*self.policy.in_keys))
+        logits = output.get("logits")
+        label = batch.get(self.tensor_keys.action)
+        gaps = _gaps(batch.get(self.tensor_keys.q_factors))
+        chosen = logits.detach().argmax(-1)
+        return TensorDict(
+            {
+                "loss_policy": _LOSSES[self.loss](logits, label, gaps).mean(),
+                "accuracy": (chosen == label).to(logits.dtype).mean(),
+                "regret": gaps.gather(-1, chosen.unsqueeze(-1)).mean(),
+            }
+        )
+
+
+def _gaps(q_factors: Tensor) -> Tensor:
+    """Q-factors minus their smallest, zero where illegal."""
+    gaps = q_factors - q_factors.amin(-1, keepdim=True)
+    return gaps.masked_fill(~torch.isfinite(gaps), 0.0)
+
+
+def _l2(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:
+    target = torch.nn.functional.one_hot(label, logits.shape[-1])
+    return (logits.softmax(-1) - target).square().sum(-1)
+
+
+def _cross_entropy(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:
+    return torch.nn.functional.cross_entropy(logits, label, reduction="none")
+
+
+def _cost_weighted(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:
+    scale = gaps.sum(-1, keepdim=True).clamp_min(torch.finfo(gaps.dtype).tiny)
+    return (logits.softmax(-1) * gaps / scale).sum(-1)
+
+
+_LOSSES = {"l2": _l2, "cross_entropy": _cross_entropy, "cost_weighted": _cost_weighted}
