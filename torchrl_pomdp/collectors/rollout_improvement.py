@@ -17,8 +17,8 @@ from torchrl_pomdp.modules.rollout import Policy
 
 __all__ = ["RolloutImprovement"]
 
-# States labelled between two updates of the progress bar; labels do not depend on it.
-_BLOCK = 1024
+# States drawn at once and labelled between two updates of the progress bar; the data do not depend on either.
+_DRAWN, _LABELLED = 32768, 1024
 
 
 class RolloutImprovement(Collector):
@@ -102,17 +102,15 @@ class RolloutImprovement(Collector):
         # Batches are shared out in blocks, so that the workers' stacked batches are in order.
         first = (self._batches * self.num_workers + (self.worker_idx or 0)) * size
         self._batches += 1
+        index = torch.arange(first, first + size, device=self.env.device)
         blocks = []
         with tqdm(total=size, unit="state", desc="label", disable=not self.progress, leave=False) as bar:
-            for start in range(first, first + size, _BLOCK):
-                index = torch.arange(start, min(start + _BLOCK, first + size), device=self.env.device)
-                blocks.append(self._labelled(index))
-                bar.update(index.numel())
-        return torch.cat(blocks)
-
-    def _labelled(self, index: torch.Tensor) -> TensorDictBase:
-        y = self.labeller(self.env.model.with_features(self.states(index)))
-        return y.set(("collector", "mask"), torch.ones(y.batch_size, dtype=torch.bool, device=y.device))
+            for numbers in index.split(_DRAWN):
+                for y in self.env.model.with_features(self.states(numbers)).split(_LABELLED):
+                    blocks.append(self.labeller(y))
+                    bar.update(y.batch_size.numel())
+        batch = torch.cat(blocks)
+        return batch.set(("collector", "mask"), torch.ones(size, dtype=torch.bool, device=batch.device))
 
     def state_dict(self):
         """State of the base policy and the number of batches made."""

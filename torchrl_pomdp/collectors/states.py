@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf
+from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf, take_rows
 from torchrl_pomdp.modules.rollout import Policy, step_noise
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 
@@ -144,7 +144,7 @@ class VisitedStates:
             if rest.numel() == 0:
                 break
             if rest.numel() < live.numel():
-                y, live = model.rows(y, rest), live[rest]
+                y, live = take_rows(y, rest), live[rest]
             self._pick(picked, seen, y, live, flat, step)
             u = self._control(y, flat[live], step)
             _, y = model.advance(y, u, step_noise(fold(flat[live], _STEPS), step, model.noise_dim))

@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.noise import fingerprint
 
-__all__ = ["BeliefEnv", "BeliefModel", "StateGenerator", "inverse_cdf"]
+__all__ = ["BeliefEnv", "BeliefModel", "StateGenerator", "inverse_cdf", "take_rows"]
 
 StateGenerator = Callable[[Tensor], TensorDictBase]
 """Distribution of feature states: maps int64 keys ``[*B]`` to feature states ``[*B]``, the same key to the same state."""
@@ -45,6 +45,26 @@ def inverse_cdf(probs: Tensor, noise: Tensor, dim: int = -1) -> Tensor:
     return (cumulative.narrow(dim, 0, probs.shape[dim] - 1) <= threshold).sum(dim)
 
 
+def take_rows(y: TensorDictBase, index: Tensor) -> TensorDictBase:
+    """Rows ``index`` (int64 ``[M]``) of the flat batch ``y`` ``[N]``, each entry in the memory layout that it has.
+
+    Indexing ``y[index]`` would turn entries whose batch dimension is innermost, such as beliefs kept as planes, into
+    row-major ones, and every later step would pay for turning them back.
+
+    Examples:
+        >>> y = TensorDict({"belief": torch.rand(3, 5).T}, [5])
+        >>> take_rows(y, torch.tensor([4, 0]))["belief"].stride()
+        (1, 2)
+    """
+
+    def take(leaf: Tensor) -> Tensor:
+        if leaf.ndim > 1 and leaf.stride(0) == 1:
+            return leaf.movedim(0, -1).index_select(-1, index).movedim(-1, 0)
+        return leaf.index_select(0, index)
+
+    return TensorDict({key: take(leaf) for key, leaf in y.items()}, batch_size=index.shape, device=y.device)
+
+
 class BeliefModel(nn.Module, ABC):
     r"""A POMDP seen through its feature state :math:`y` (paper, Section II), as batched pure tensor functions.
 
@@ -54,9 +74,10 @@ class BeliefModel(nn.Module, ABC):
     ``y`` carries, so nothing is computed that nobody reads.
 
     Subclasses define :meth:`state_spec`, :meth:`action_mask`, :meth:`expected_cost`, :meth:`observation_probs` and
-    :meth:`estimator`; they may override :meth:`advance` and :meth:`rows` to be faster.
+    :meth:`estimator`; they may override :meth:`advance` to be faster.
 
     Attributes:
+        state_keys: names of the core entries.
         num_controls: U, the size of the control set.
         num_observations: Z, the size of the observation set.
         noise_dim: uniforms consumed by one sampled step.
@@ -67,6 +88,7 @@ class BeliefModel(nn.Module, ABC):
         ValueError: if ``discount`` is not in (0, 1).
     """
 
+    state_keys: tuple[str, ...]
     num_controls: int
     num_observations: int
     noise_dim: int = 1
@@ -117,15 +139,6 @@ class BeliefModel(nn.Module, ABC):
     def is_terminal(self, y: TensorDictBase) -> Tensor:
         """Bool ``[*B]``: no cost follows from here whatever is done. A discounted model need not have such states."""
         return torch.zeros(y.batch_size, dtype=torch.bool, device=self.device)
-
-    def rows(self, y: TensorDictBase, index: Tensor) -> TensorDictBase:
-        """Rows ``index`` (int64 ``[M]``) of the flat batch ``y`` ``[N]``, in the layout the model computes fastest in."""
-        return y[index]
-
-    @property
-    def state_keys(self) -> tuple[str, ...]:
-        """Core entries of a feature state."""
-        return tuple(self.state_spec().keys())
 
     def fingerprint(self, y: TensorDictBase) -> Tensor:
         """Hash of the core entries, int64 ``[*B]``: identifies a feature state to noise and to memories."""
@@ -241,7 +254,6 @@ class BeliefEnv(EnvBase):
         torch.Size([4, 3, 1])
     """
 
-    batch_locked = False
     _supports_set_state = True
 
     def __init__(
@@ -252,11 +264,17 @@ class BeliefEnv(EnvBase):
         batch_size: torch.Size | tuple[int, ...] = (),
         seed: int = 0,
     ) -> None:
-        super().__init__(device=model.device, batch_size=torch.Size(batch_size))
+        # A state that a caller sets may be terminal already.
+        super().__init__(device=model.device, batch_size=torch.Size(batch_size), allow_done_after_reset=True)
         self.model = model
         self.generator = generator
         self._make_specs()
         self.set_seed(seed)
+
+    @property
+    def batch_locked(self) -> bool:
+        """Whether the batch size is fixed."""
+        return len(self.batch_size) > 0
 
     def _make_specs(self) -> None:
         shape, device = self.batch_size, self.device

@@ -18,6 +18,8 @@ __all__ = ["CalibratedStart", "FixedBelief", "InPart", "RandomState", "UniformSt
 
 # What a key's independent streams of uniforms are for.
 _ORDER, _LEVELS, _ROBOTS, _OBSERVE, _FRACTION, _AGE, _RETRY = range(7)
+# Candidates that a rejection round makes at once.
+_BATCH = 4096
 
 
 class UniformStart:
@@ -154,25 +156,34 @@ class InPart:
             parts = 0 if model.partition is None else model.partition.num_parts
             raise ValueError(f"part must be one of the model's {parts} parts, got {part}")
         self.model, self.proposal, self.part, self.max_tries = model, proposal, part, max_tries
+        self.partition = model.partition
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` of the part for int64 keys ``[*B]``; terminal states are rejected too."""
-        assert self.model.partition is not None
         flat = keys.reshape(-1)
         result = self.proposal(flat)
-        missing = torch.arange(flat.numel(), device=keys.device)
-        candidate = result
-        for attempt in range(self.max_tries):
-            accepted = (self.model.partition(candidate) == self.part) & ~self.model.is_terminal(candidate)
-            result[missing[accepted]] = candidate[accepted]
-            missing = missing[~accepted]
-            if missing.numel() == 0:
-                return result.view(keys.shape)
-            candidate = self.proposal(fold(fold(flat[missing], _RETRY), attempt))
+        missing = (~self._accepted(result)).nonzero().squeeze(-1)
+        tried = 1
+        while missing.numel() and tried < self.max_tries:
+            # Several candidates at once where few states are missing; the first acceptable one counts in any case.
+            width = min(max(1, _BATCH // missing.numel()), self.max_tries - tried)
+            attempts = torch.arange(tried, tried + width, device=keys.device)
+            tried += width
+            candidates = self.proposal(fold(fold(flat[missing], _RETRY).unsqueeze(-1), attempts).flatten())
+            accepted = self._accepted(candidates).view(-1, width)
+            found, first = accepted.any(-1), accepted.to(torch.int64).argmax(-1)
+            chosen = torch.arange(missing.numel(), device=keys.device) * width + first
+            result[missing[found]] = candidates[chosen[found]]
+            missing = missing[~found]
+        if missing.numel() == 0:
+            return result.view(keys.shape)
         raise ValueError(
-            f"no state of part {self.part} ({self.model.partition.names[self.part]}) among {self.max_tries} candidates "
+            f"no state of part {self.part} ({self.partition.names[self.part]}) among {self.max_tries} candidates "
             f"of {type(self.proposal).__name__}: choose a proposal that reaches it"
         )
+
+    def _accepted(self, y: TensorDictBase) -> Tensor:
+        return (self.partition(y) == self.part) & ~self.model.is_terminal(y)
 
 
 class FixedBelief:

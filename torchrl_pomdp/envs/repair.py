@@ -83,6 +83,7 @@ class RepairModel(BeliefModel):
         'line of 20, 1 robot: 1.9e+15 states, 3 controls, 5 observations, discount 0.99'
     """
 
+    state_keys = ("belief", "location")
     chain: Tensor
     costs: Tensor
     destinations: Tensor
@@ -263,13 +264,6 @@ class RepairModel(BeliefModel):
     def degrade(self, belief: Tensor, steps: int = 1) -> Tensor:
         """Marginals ``[..., K]`` after ``steps`` steps of the chain without repairs or observations."""
         return belief @ torch.linalg.matrix_power(self.chain, steps)
-
-    def rows(self, y: TensorDictBase, index: Tensor) -> TensorDictBase:
-        """Rows ``index`` of a flat batch, kept as planes; see :meth:`BeliefModel.rows`."""
-        planes = self._planes(y).flatten(0, 1).index_select(1, index)
-        core = {"belief": planes.view(self.num_levels, self.num_locations, -1).permute(2, 1, 0)}
-        rest = {key: value.index_select(0, index) for key, value in y.items() if key != "belief"}
-        return type(y)({**core, **rest}, batch_size=index.shape, device=self.device)
 
     # ---- kernels on planes [K, L, N] and locations [R, N] ----------------------------------------------------------
 

@@ -38,6 +38,7 @@ class TabularModel(BeliefModel):
         'TabularModel: 3 controls, 2 observations, discount 0.95'
     """
 
+    state_keys = ("belief",)
     transition: Tensor
     observation: Tensor
     cost: Tensor

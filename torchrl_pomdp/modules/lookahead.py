@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf
+from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf, take_rows
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.noise import fold, uniform
 
@@ -109,9 +109,9 @@ class RolloutPolicy(TensorDictModuleBase):
         core = y.select(*model.state_keys)
         # [N, n]: one key for each state and trajectory, shared by the state's controls.
         keys = fold(fold(model.fingerprint(core), self.seed).unsqueeze(-1), self._trajectory_index)
-        pairs = model.rows(core, state)
+        pairs = take_rows(core, state)
         leaves = self._sample_leaves(model.observation_probs(pairs, u), keys[state])
-        successors = model.estimator(model.rows(pairs, leaves.pair), u[leaves.pair], leaves.observation)
+        successors = model.estimator(take_rows(pairs, leaves.pair), u[leaves.pair], leaves.observation)
         cost = self.cost_to_go(successors, fold(keys[state[leaves.pair], leaves.trajectory], 1)) * leaves.weight
         expected = torch.zeros(u.shape, dtype=cost.dtype, device=cost.device).index_add_(0, leaves.pair, cost)
         q = torch.full(y.get("action_mask").shape, torch.inf, dtype=cost.dtype, device=cost.device)

@@ -9,6 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torchrl_pomdp.envs.belief import take_rows
+
 __all__ = ["PartitionedPolicy"]
 
 
@@ -38,6 +40,9 @@ class PartitionedPolicy(TensorDictModuleBase):
         if not policies:
             raise ValueError("policies is empty: a partitioned policy needs one policy for each part")
         self.policies = nn.ModuleList(policies)
+        # A policy that is local to several parts is called once for all of them.
+        self._distinct = list(dict.fromkeys(policies))
+        self.register_buffer("_policy_of_part", torch.tensor([self._distinct.index(p) for p in policies]), persistent=False)
         read = {str(key): None for policy in policies for key in policy.in_keys}
         self.in_keys = [*read, "partition"]
         written = [set(policy.out_keys) for policy in policies]
@@ -46,17 +51,18 @@ class PartitionedPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the entries that all local policies write, ``"action"`` among them."""
         part = tensordict.get("partition").reshape(-1)
+        if part.numel() and not 0 <= int(part.min()) <= int(part.max()) < len(self.policies):
+            raise ValueError(f"partition must hold parts 0..{len(self.policies) - 1}, got {part.unique().tolist()}")
         flat = tensordict.select(*self.in_keys).reshape(-1)
-        present = part.unique().tolist()
-        if present and not 0 <= present[0] <= present[-1] < len(self.policies):
-            raise ValueError(f"partition must hold parts 0..{len(self.policies) - 1}, got {present}")
-        order = part.argsort(stable=True)
-        outputs = [
-            self.policies[nu](flat[rows]).select(*self.out_keys)
-            for nu in present
-            for rows in [(part == nu).nonzero().squeeze(-1)]
-        ]
-        if not outputs:
-            raise ValueError("the batch is empty: there is no state to choose a control for")
-        merged = torch.cat(outputs, 0)[order.argsort()]
-        return tensordict.update(merged.reshape(tensordict.batch_size))
+        if len(self._distinct) == 1:
+            result = self._distinct[0](flat).select(*self.out_keys)
+        else:
+            chosen = self._policy_of_part[part]
+            present = chosen.unique().tolist()
+            rows = [(chosen == number).nonzero().squeeze(-1) for number in present]
+            outputs = [
+                self._distinct[number](take_rows(flat, index)).select(*self.out_keys)
+                for number, index in zip(present, rows, strict=True)
+            ]
+            result = torch.cat(outputs, 0)[torch.cat(rows).argsort()]
+        return tensordict.update(result.reshape(tensordict.batch_size))

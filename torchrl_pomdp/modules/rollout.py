@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_pomdp.envs.belief import BeliefModel
+from torchrl_pomdp.envs.belief import BeliefModel, take_rows
 from torchrl_pomdp.noise import uniform
 
 __all__ = ["Policy", "TerminalCost", "TruncatedRollout", "step_noise"]
@@ -110,4 +110,4 @@ class TruncatedRollout(nn.Module):
         if count <= _DROP_FRACTION * ended.numel():
             return y, keys, live, ended
         rest = (~ended).nonzero().squeeze(-1)
-        return self.model.rows(y, rest), keys[rest], live[rest], ended[rest]
+        return take_rows(y, rest), keys[rest], live[rest], ended[rest]

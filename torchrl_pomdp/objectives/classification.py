@@ -14,12 +14,16 @@ from torchrl.objectives import LossModule
 
 __all__ = ["ClassificationLoss"]
 
-LossName = Literal["l2", "cross_entropy", "cost_weighted"]
+LossName = Literal["soft", "cross_entropy", "cost_weighted", "l2"]
+# Temperature of the soft targets as a fraction of the state's sum of gaps.
+_TEMPERATURE = 0.1
 
 
 class ClassificationLoss(LossModule):
     r"""Loss of a masked policy network against labels :math:`(y^s,u^s)` with Q-factors.
 
+    * ``"soft"``: cross-entropy with the targets softmax(-gap/τ), τ a tenth of the state's sum of gaps. Controls that are
+      nearly as good share the label, so that the noise of the Q-factors is not learnt.
     * ``"l2"``: squared distance of the softmax from the one-hot rollout control, the paper's.
     * ``"cross_entropy"``: negative log-probability of the rollout control.
     * ``"cost_weighted"``: the expected gap :math:`\sum_u\pi(u)\,(\tilde Q(y,u)-\min\tilde Q)`, divided by the state's sum
@@ -60,7 +64,7 @@ class ClassificationLoss(LossModule):
     policy_params: TensorDictParams
     target_policy_params: TensorDictParams
 
-    def __init__(self, policy: TensorDictModuleBase, loss: LossName = "cross_entropy") -> None:
+    def __init__(self, policy: TensorDictModuleBase, loss: LossName = "soft") -> None:
         super().__init__()
         if loss not in _LOSSES:
             raise ValueError(f"loss must be one of {sorted(_LOSSES)}, got {loss!r}")
@@ -119,4 +123,11 @@ def _cost_weighted(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:
     return (logits.softmax(-1) * gaps / scale).sum(-1)
 
 
-_LOSSES = {"l2": _l2, "cross_entropy": _cross_entropy, "cost_weighted": _cost_weighted}
+def _soft(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:
+    legal = torch.isfinite(logits)
+    temperature = (_TEMPERATURE * gaps.sum(-1, keepdim=True)).clamp_min(torch.finfo(gaps.dtype).tiny)
+    target = (-gaps / temperature).masked_fill(~legal, -torch.inf).softmax(-1)
+    return -(target * logits.log_softmax(-1).masked_fill(~legal, 0.0)).sum(-1)
+
+
+_LOSSES = {"soft": _soft, "l2": _l2, "cross_entropy": _cross_entropy, "cost_weighted": _cost_weighted}

@@ -1,0 +1,22 @@
+.DELETE_ON_ERROR:
+.PHONY: demo test lint
+
+PYTHON ?= python3
+BIN := .venv/bin
+DEMO ?= runs/demo-$(shell date +%Y%m%d-%H%M%S)
+
+demo: .venv/installed
+	$(BIN)/torchrl-pomdp train linear20 --samples-per-part 15000 --iterations 2 --out $(DEMO)
+
+test: .venv/installed lint
+	$(BIN)/pytest
+
+lint: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@

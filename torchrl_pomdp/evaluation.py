@@ -1,0 +1,142 @@
+"""Comparing policies: discounted costs from the same start states under the same noise (paper, Section VI-C)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
+from torchrl_pomdp.modules.rollout import Policy, TruncatedRollout
+from torchrl_pomdp.noise import fold, seed_keys
+
+__all__ = ["Comparison", "Estimate", "compare", "discounted_costs", "estimate"]
+
+# Half width of a 95 % interval in standard errors.
+_Z95 = 1.96
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean with its standard error.
+
+    Attributes:
+        mean: sample mean.
+        standard_error: of the mean.
+        count: sample size.
+    """
+
+    mean: float
+    standard_error: float
+    count: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval (normal approximation)."""
+        half = _Z95 * self.standard_error
+        return self.mean - half, self.mean + half
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A policy against a baseline, paired by start state and noise.
+
+    Attributes:
+        cost: discounted cost of the policy.
+        difference: policy minus baseline.
+        ratio: mean cost over the baseline's mean cost, its standard error by the delta method.
+    """
+
+    cost: Estimate
+    difference: Estimate
+    ratio: Estimate
+
+
+def discounted_costs(
+    model: BeliefModel,
+    policy: Policy,
+    start: StateGenerator,
+    *,
+    num_states: int = 1000,
+    seed: int = 0,
+    max_steps: int = 400,
+    progress: bool = False,
+    name: str = "evaluate",
+) -> Tensor:
+    """Discounted cost of one trajectory of ``policy`` from each of ``num_states`` start states.
+
+    Start state i and the noise of its trajectory depend on (seed, i) alone: costs of different policies are paired.
+
+    Args:
+        model: the belief model.
+        policy: the policy.
+        start: generator of start states.
+
+    Keyword Args:
+        num_states: number of start states.
+        seed: seed of the start states and of the noise.
+        max_steps: stages after which a trajectory is cut.
+        progress: whether to show a progress bar.
+        name: label of the progress bar.
+
+    Returns:
+        costs ``[num_states]``.
+
+    Raises:
+        ValueError: if ``num_states`` is not positive.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> problem = make_problem("linear20")
+        >>> costs = discounted_costs(problem.model, GreedyRepair(problem.model), problem.start, num_states=50)
+        >>> estimate(costs).count
+        50
+    """
+    if num_states < 1:
+        raise ValueError(f"num_states must be at least 1, got {num_states}")
+    cost = TruncatedRollout(model, policy, max_steps=max_steps)
+    keys = seed_keys(seed, torch.arange(num_states, device=model.device))
+    blocks = []
+    with tqdm(total=num_states, unit="state", desc=name, disable=not progress, leave=False) as bar:
+        for block in keys.split(250):
+            blocks.append(cost(start(fold(block, 0)), fold(block, 1)))
+            bar.update(block.numel())
+    return torch.cat(blocks)
+
+
+def estimate(values: Tensor) -> Estimate:
+    """Mean and standard error of independent values ``[N]``; the error is NaN for a single value.
+
+    Examples:
+        >>> estimate(torch.tensor([1.0, 3.0]))
+        Estimate(mean=2.0, standard_error=1.0, count=2)
+    """
+    values = values.double()
+    error = values.std() / values.numel() ** 0.5 if values.numel() > 1 else torch.tensor(torch.nan)
+    return Estimate(float(values.mean()), float(error), values.numel())
+
+
+def compare(costs: Tensor, baseline: Tensor) -> Comparison:
+    """Compare paired costs ``[N]`` with a baseline's ``[N]``.
+
+    Raises:
+        ValueError: if the shapes differ.
+
+    Examples:
+        >>> compare(torch.tensor([9.0, 18.0]), torch.tensor([10.0, 20.0])).ratio
+        Estimate(mean=0.9, standard_error=0.0, count=2)
+    """
+    if costs.shape != baseline.shape:
+        raise ValueError(f"costs and baseline must be paired, got shapes {tuple(costs.shape)} and {tuple(baseline.shape)}")
+    costs, baseline = costs.double(), baseline.double()
+    mean = baseline.mean()
+    ratio = float(costs.mean() / mean)
+    residual = estimate((costs - ratio * baseline) / mean)
+    return Comparison(
+        cost=estimate(costs),
+        difference=estimate(costs - baseline),
+        ratio=Estimate(ratio, residual.standard_error, costs.numel()),
+    )

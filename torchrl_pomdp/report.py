@@ -1,0 +1,129 @@
+"""Tables and pictures of results."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_pomdp.envs.repair import REPAIR, RepairModel
+from torchrl_pomdp.evaluation import Comparison, Estimate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Result", "cost_figure", "table", "trajectory_figure", "write_metrics"]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A policy's name and its comparison with the baseline."""
+
+    name: str
+    comparison: Comparison
+
+
+def table(results: Sequence[Result]) -> str:
+    """Markdown table of costs, paired differences and ratios, each with its 95 % interval.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_pomdp.evaluation import compare
+        >>> cost = torch.tensor([10.0, 20.0])
+        >>> print(table([Result("greedy", compare(cost, cost))]))
+        | policy | discounted cost | difference | ratio | 95 % interval of the ratio |
+        |---|---|---|---|---|
+        | greedy | 15.0 ± 9.8 | +0.0 ± 0.0 | 1.000 | 1.000 … 1.000 |
+    """
+    lines = [
+        "| policy | discounted cost | difference | ratio | 95 % interval of the ratio |",
+        "|---|---|---|---|---|",
+    ]
+    for result in results:
+        c = result.comparison
+        low, high = c.ratio.interval
+        lines.append(
+            f"| {result.name} | {c.cost.mean:.1f} ± {_half(c.cost):.1f} | {c.difference.mean:+.1f} ± "
+            f"{_half(c.difference):.1f} | {c.ratio.mean:.3f} | {low:.3f} … {high:.3f} |"
+        )
+    return "\n".join(lines)
+
+
+def write_metrics(path: Path, results: Sequence[Result]) -> None:
+    """Write results as CSV, one policy a row; means, standard errors and sample sizes."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(
+            ["policy", "states", "cost", "cost_se", "difference", "difference_se", "ratio", "ratio_se"]
+        )
+        for result in results:
+            c = result.comparison
+            estimates = (c.cost, c.difference, c.ratio)
+            values = [value for e in estimates for value in (e.mean, e.standard_error)]
+            writer.writerow([result.name, c.cost.count, *values])
+
+
+def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
+    """Bars of discounted cost with 95 % intervals.
+
+    Raises:
+        ImportError: if matplotlib, the extra ``plot``, is not installed.
+    """
+    figure = _new_figure(1.4 * len(results) + 1.6, 3.6)
+    axes = figure.add_subplot()
+    means = [result.comparison.cost.mean for result in results]
+    names = [f"{result.name}\n{result.comparison.ratio.mean:.3f}" for result in results]
+    errors = [_half(result.comparison.cost) for result in results]
+    axes.bar(names, means, yerr=errors, capsize=5, color=["#9aa5b1"] + ["#3572a5"] * (len(results) - 1))
+    axes.set_ylabel("discounted cost")
+    axes.set_title(title)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def trajectory_figure(model: RepairModel, trajectory: TensorDictBase, title: str = "") -> Figure:
+    """One trajectory: locations by time, colour the expected damage, robots' paths over it, repairs marked.
+
+    Args:
+        model: the repair model.
+        trajectory: ``[T]`` with ``belief``, ``location`` and ``action``, as ``BeliefEnv.rollout`` gives it.
+        title: title of the figure.
+
+    Raises:
+        ImportError: if matplotlib, the extra ``plot``, is not installed.
+    """
+    steps = trajectory.batch_size[0]
+    damage = trajectory["belief"] @ torch.arange(model.num_levels, dtype=model.dtype, device=model.device)
+    figure = _new_figure(max(5.0, 0.14 * steps + 2.5), max(2.5, 0.16 * model.num_locations + 1.2))
+    axes = figure.add_subplot()
+    image = axes.imshow(
+        damage.T.cpu(), aspect="auto", cmap="YlOrRd", vmin=0, vmax=model.num_levels - 1, interpolation="nearest"
+    )
+    figure.colorbar(image, ax=axes, label="expected damage level")
+    controls = model.split_controls(trajectory["action"])
+    for robot in range(model.num_robots):
+        path = trajectory["location"][:, robot].cpu()
+        axes.plot(range(steps), path, color="#1f4e79", linewidth=1.2, label=f"robot {robot + 1}")
+        repairs = (controls[:, robot] == REPAIR).nonzero().squeeze(-1).cpu()
+        axes.scatter(repairs, path[repairs], marker="P", s=26, color="#1f4e79", edgecolor="white", linewidth=0.4)
+    axes.scatter([], [], marker="P", color="#1f4e79", label="repair")
+    axes.legend(loc="upper right", fontsize="small")
+    axes.set(xlabel="stage", ylabel="location", title=title)
+    return figure
+
+
+def _half(value: Estimate) -> float:
+    return (value.interval[1] - value.interval[0]) / 2
+
+
+def _new_figure(width: float, height: float) -> Figure:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("pictures need matplotlib: pip install 'torchrl-pomdp[plot]'") from error
+    return Figure(figsize=(width, height), layout="constrained", dpi=120)
