@@ -100,7 +100,7 @@ def _train(command: Train) -> None:
     greedy = GreedyRepair(problem.model)
     baseline = _costs(problem, greedy, command.states, "greedy")
     results = [Result("greedy", compare(baseline, baseline))]
-    rollout = RolloutPolicy(problem.model, greedy, trajectories=config.trajectories, leaves=config.leaves)
+    rollout = RolloutPolicy(problem.model, greedy)
     _add(results, "R-NT", _costs(problem, rollout, command.states, "R-NT"), baseline, problem, out)
     logger = CSVLogger("log", log_dir=str(out))
     best: tuple[float, Policy] = (results[0].comparison.cost.mean, greedy)

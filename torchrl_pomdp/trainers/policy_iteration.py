@@ -227,8 +227,6 @@ class _Stepper(DefaultOptimizationStepper):
         losses = super().step(trainer, sub_batch)
         self.schedule.step()
         self.count += 1
-        if self.count == 1:
-            import time; print("label done", time.strftime("%X"), flush=True)
         if self.logger is not None and self.count % _LOG_INTERVAL == 0:
             for key in ("loss_policy", "accuracy", "regret"):
                 self.logger.log_scalar(f"{self.name}/{key}".replace(" ", "_"), losses[key].item(), step=self.count)

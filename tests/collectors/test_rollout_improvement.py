@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from torchrl.collectors import MultiSyncCollector
+from torchrl.envs import PendulumEnv
+
+from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief, make_problem, tiger
+from torchrl_pomdp.modules import GreedyRepair, RolloutPolicy
+
+LABEL = partial(RolloutPolicy, trajectories=2, max_steps=80)
+
+
+def make_env():
+    problem = make_problem("linear20")
+    return BeliefEnv(problem.model, problem.start)
+
+
+def make_policy():
+    return GreedyRepair(make_problem("linear20").model)
+
+
+def make_states():
+    return PartSampler(dict(enumerate(make_problem("linear20").training)), seed=3)
+
+
+def collector(frames_per_batch=30, total_frames=60, **kwargs):
+    return RolloutImprovement(
+        make_env(),
+        make_policy(),
+        states=make_states(),
+        frames_per_batch=frames_per_batch,
+        total_frames=total_frames,
+        label=LABEL,
+        **kwargs,
+    )
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return torch.cat(list(collector()))
+
+
+def test_batches_are_flat_and_complete(reference):
+    batches = list(collector())
+    assert [batch.batch_size for batch in batches] == [torch.Size([30])] * 2
+    keys = set(batches[0].keys(include_nested=True, leaves_only=True))
+    assert keys == {
+        "belief", "location", "action_mask", "partition", "action", "q_factors", ("collector", "mask"),
+    }  # fmt: skip
+    assert batches[0]["collector", "mask"].all()
+    assert batches[0]["action_mask"].gather(1, batches[0]["action"].unsqueeze(1)).all()
+    assert (torch.cat(batches) == reference).all()
+
+
+@pytest.mark.parametrize("frames", [10, 20, 60])
+def test_the_same_states_have_the_same_labels_in_any_batch_size(reference, frames):
+    assert (torch.cat(list(collector(frames))) == reference).all()
+
+
+def test_any_number_of_workers_makes_the_same_data(reference):
+    workers = MultiSyncCollector(
+        [make_env] * 2,
+        make_policy(),
+        collector_class=partial(RolloutImprovement, states=make_states(), label=LABEL, num_workers=2),
+        frames_per_batch=30,
+        total_frames=60,
+        use_buffers=False,
+        cat_results="stack",
+    )
+    try:
+        data = torch.cat([batch.reshape(-1) for batch in workers])
+    finally:
+        workers.shutdown()
+    for key in ("belief", "action", "q_factors", "partition"):
+        assert torch.equal(data[key], reference[key])
+
+
+def test_resumes_from_its_state():
+    first = iter(source := collector(total_frames=-1))
+    next(first)
+    state = source.state_dict()
+    expected = next(first)
+    again = collector(total_frames=-1)
+    again.load_state_dict(state)
+    assert (next(iter(again)) == expected).all()
+
+
+def test_keeps_its_own_copy_of_the_policy(linear20):
+    from torchrl_pomdp.modules import FlatEncoder, PolicyNetwork
+
+    network = PolicyNetwork(FlatEncoder(linear20.model), 3, (4,), generator=torch.Generator().manual_seed(0))
+    data = [
+        RolloutImprovement(make_env(), network, states=make_states(), frames_per_batch=6, total_frames=6, label=LABEL)
+        for _ in range(2)
+    ]
+    before = next(iter(data[0]))
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+    assert (next(iter(data[1])) == before).all()
+
+
+def test_tabular_models_are_labelled_by_the_same_collector():
+    model = tiger()
+    start = FixedBelief(torch.tensor([0.5, 0.5]))
+
+    def open_left(y):
+        return y.set("action", torch.ones(y.batch_size, dtype=torch.int64))
+
+    source = RolloutImprovement(
+        BeliefEnv(model, start), open_left, states=start, frames_per_batch=4, total_frames=4, label=LABEL
+    )
+    batch = next(iter(source))
+    assert batch["action"].tolist() == [0] * 4, "listening beats opening a door blindly"
+    assert batch["q_factors"].shape == (4, 3)
+
+
+def test_other_environments_are_refused():
+    with pytest.raises(TypeError, match="must give a BeliefEnv, got PendulumEnv"):
+        RolloutImprovement(PendulumEnv(), make_policy(), states=make_states(), frames_per_batch=4)
+    with pytest.raises(ValueError, match="num_workers"):
+        collector(num_workers=0)

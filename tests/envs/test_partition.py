@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from _oracles import random_states, small_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from torchrl_pomdp.collectors import Mixture, PartSampler, VisitedStates
+from torchrl_pomdp.envs import CalibratedStart, InPart, RandomState, RepairPartition, SinglePart, grid, line, make_problem
+from torchrl_pomdp.modules import GreedyRepair
+from torchrl_pomdp.noise import fold, seed_keys, uniform
+
+
+def part_by_hand(graph, costs, belief, location):
+    """The definition of Section VI-B for one state, in plain Python."""
+    expected = [sum(float(p) * float(c) for p, c in zip(row, costs, strict=True)) for row in belief]
+    damaged = sum(float(row[0]) < 1 for row in belief)
+    centre = sum(float(graph.columns[place]) for place in location) / len(location)
+    left = sum(e for e, column in zip(expected, graph.columns.tolist(), strict=True) if column < centre)
+    right = sum(e for e, column in zip(expected, graph.columns.tolist(), strict=True) if column > centre)
+    share = 0.5 if left + right == 0 else left / (left + right)
+    density = 0 if share > 0.7 else 2 if share < 0.3 else 1
+    return (3 if 2 * damaged < len(belief) else 0) + density
+
+
+@given(seed=st.integers(0, 10_000), case=st.sampled_from([(line(5), 1), (grid(3, 2), 1), (line(4), 2)]))
+@settings(max_examples=40, deadline=None)
+def test_every_state_is_in_the_one_part_that_the_definition_gives(seed, case):
+    graph, robots = case
+    model = small_model(graph, robots)
+    y = random_states(model, 20, seed)
+    parts = RepairPartition(graph, model.costs)(y)
+    for row in range(20):
+        assert parts[row] == part_by_hand(graph, model.costs, y["belief"][row], y["location"][row].tolist())
+
+
+def test_no_damage_on_either_side_is_balanced():
+    partition = RepairPartition(line(3), torch.tensor([0.0, 1.0]))
+    belief = torch.tensor([[[1.0, 0], [0, 1.0], [1.0, 0]]])
+    y = TensorDict({"belief": belief, "location": torch.tensor([[1]])}, [1])
+    assert partition(y).tolist() == [4]
+
+
+def test_endgame_leads_to_endgame_alone(linear20):
+    model = linear20.model
+    y = model.with_features(torch.cat([linear20.training[part](torch.arange(50)) for part in (3, 4, 5)]))
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        u = torch.multinomial(y["action_mask"].float(), 1, generator=generator).squeeze(-1)
+        _, y = model.advance(y, u, torch.rand(150, 1, generator=generator))
+        assert (y["partition"] >= 3).all()
+
+
+def test_generators_fill_their_parts_and_are_functions_of_the_key(linear20):
+    keys = seed_keys(1, torch.arange(60))
+    for part, generator in enumerate(linear20.training):
+        y = generator(keys)
+        linear20.model.check_state(y)
+        assert (linear20.model.partition(y) == part).all()
+        assert torch.equal(generator(keys[7:31])["belief"], y["belief"][7:31])
+
+
+def test_calibrated_start_has_the_distribution_it_says(linear20):
+    y = CalibratedStart(linear20.model, observe_start=False)(seed_keys(0, torch.arange(4000)))
+    possible = y["belief"][..., 0] < 1
+    assert (possible.sum(-1) == 14).all()
+    assert (possible.float().mean(0) - 0.7).abs().max() < 0.04
+    beliefs = y["belief"][possible]
+    # Dirichlet(1, …, 1) over five levels: mean 1/5, variance 4 / 150.
+    assert (beliefs.mean(0) - 0.2).abs().max() < 0.005
+    assert (beliefs.var(0) - 4 / 150).abs().max() < 0.002
+    assert (y["location"][:, 0].bincount(minlength=20) / 4000 - 0.05).abs().max() < 0.02
+    observed = linear20.start(seed_keys(0, torch.arange(50)))
+    here = observed["belief"][torch.arange(50), observed["location"][:, 0]]
+    assert ((here == 0) | (here == 1)).all()
+
+
+def test_visited_states_lie_on_trajectories_of_the_policy(linear20):
+    model = linear20.model
+    keys = seed_keys(2, torch.arange(200))
+    visited = VisitedStates(model, linear20.start, GreedyRepair(model), exploration=0.0, part=4)
+    y = InPart(model, visited, 4)(keys)
+    assert (model.partition(y) == 4).all()
+    assert torch.equal(InPart(model, visited, 4)(keys[50:90])["belief"], y["belief"][50:90])
+
+
+def test_sampler_numbers_states_evenly_over_parts(linear20):
+    mixture = Mixture([linear20.training[0], linear20.start], [1.0, 0.0])
+    sampler = PartSampler({0: mixture, 5: linear20.training[5]}, seed=4)
+    whole = sampler(torch.arange(40))
+    assert linear20.model.partition(whole).tolist() == [0, 5] * 20
+    assert torch.equal(sampler(torch.arange(13, 29))["belief"], whole["belief"][13:29])
+
+
+def test_bad_arguments_are_refused(linear20):
+    model = linear20.model
+    with pytest.raises(ValueError, match=r"unknown preset 'linear30'; known presets: line3, linear20"):
+        make_problem("linear30")
+    with pytest.raises(ValueError, match="damaged_fraction"):
+        CalibratedStart(model, 0.0)
+    with pytest.raises(ValueError, match="fractions"):
+        RandomState(model, (0.7, 0.2))
+    with pytest.raises(ValueError, match="max_age"):
+        RandomState(model, max_age=-1)
+    with pytest.raises(ValueError, match="part must be one of the model's 6 parts"):
+        InPart(model, RandomState(model), 6)
+    with pytest.raises(ValueError, match="no state of part 5"):
+        InPart(model, RandomState(model, (0.9, 1.0)), 5, max_tries=3)(torch.arange(2))
+    with pytest.raises(ValueError, match="damage_threshold"):
+        RepairPartition(line(3), torch.ones(5), damage_threshold=1.0)
+    with pytest.raises(ValueError, match="weights"):
+        Mixture([linear20.start], [-1.0])
+    with pytest.raises(ValueError, match="generators is empty"):
+        PartSampler({}, seed=0)
+    with pytest.raises(ValueError, match="exploration"):
+        VisitedStates(model, linear20.start, GreedyRepair(model), exploration=1.5)
+    with pytest.raises(ValueError, match="max_steps"):
+        VisitedStates(model, linear20.start, GreedyRepair(model), max_steps=0)
+    assert SinglePart().num_parts == 1
+
+
+def test_noise_is_uniform_and_independent():
+    keys = seed_keys(0, torch.arange(100_000))
+    u = torch.stack([uniform(keys, counter) for counter in range(4)] + [uniform(fold(keys, 1), 0)])
+    assert (u.mean(1) - 0.5).abs().max() < 4 / (12 * 100_000) ** 0.5
+    bins = (u * 64).long()
+    expected = 100_000 / 64
+    for row in bins:
+        chi2 = ((row.bincount(minlength=64) - expected) ** 2 / expected).sum()
+        assert chi2 < 63 + 5 * (2 * 63) ** 0.5
+    correlation = torch.corrcoef(torch.cat([u, u[:1].roll(1, 1)]).double()) - torch.eye(6)
+    assert correlation.abs().max() < 5 / 100_000**0.5
+    assert len(keys.unique()) == len(keys)

@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from _oracles import COSTS, random_states, small_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief, RepairModel, UniformStart, damage_chain, line, tiger
+from torchrl_pomdp.evaluation import discounted_costs, estimate
+from torchrl_pomdp.modules import (
+    FlatEncoder,
+    GreedyRepair,
+    PartitionedPolicy,
+    PolicyNetwork,
+    RelativeEncoder,
+    RolloutPolicy,
+    TruncatedRollout,
+)
+
+# Optimal value of Tiger from the uniform belief at discount 0.95, as a cost.
+TIGER_OPTIMUM = -19.371368
+
+
+class ListenThenOpen:
+    """Tiger: listen until one door is likely enough, then open the other."""
+
+    in_keys = ["belief"]
+
+    def __init__(self, threshold):
+        self.threshold = threshold
+
+    def __call__(self, y):
+        sure, state = y["belief"].max(-1)
+        return y.set("action", torch.where(sure > self.threshold, 2 - state, 0))
+
+
+def networks(model, seed):
+    generator = torch.Generator().manual_seed(seed)
+    return [PolicyNetwork(e(model), model.num_controls, (8,), generator=generator) for e in (FlatEncoder, RelativeEncoder)]
+
+
+@given(seed=st.integers(0, 10_000), robots=st.sampled_from([1, 2]))
+@settings(max_examples=25, deadline=None)
+def test_no_component_ever_chooses_a_masked_control(seed, robots):
+    model = small_model(line(3), robots, dtype=torch.float32)
+    y = random_states(model, 12, seed)
+    # The engine's policies meet states whose robots have observed; others may be given by a caller.
+    y = model.with_features(y if seed % 2 else model.observe(y, torch.rand(12, robots)))
+    greedy = GreedyRepair(model)
+    flat, relative = networks(model, seed)
+    components = [
+        RolloutPolicy(model, greedy, trajectories=2),
+        RolloutPolicy(model, greedy, trajectories=1, leaves="observation"),
+        greedy,
+        flat,
+        relative,
+        BeliefEnv(model, UniformStart(model, (0,) * robots), seed=seed).rand_action,
+    ]
+    for component in components:
+        u = component(y.copy())["action"]
+        assert y["action_mask"].gather(1, u.unsqueeze(1)).all(), component
+
+
+def test_q_factors_are_infinite_exactly_where_illegal(linear20):
+    y = linear20.model.with_features(linear20.start(torch.arange(50)))
+    q = RolloutPolicy(linear20.model, GreedyRepair(linear20.model), trajectories=2).q_factors(y)
+    assert torch.equal(torch.isfinite(q), y["action_mask"])
+
+
+def test_labels_do_not_depend_on_batch_order_or_chunks(linear20):
+    model = linear20.model
+    y = linear20.start(torch.arange(60))
+    order = torch.randperm(60, generator=torch.Generator().manual_seed(0))
+    network = PolicyNetwork(RelativeEncoder(model), 3, generator=torch.Generator().manual_seed(0))
+    for base in (GreedyRepair(model), network):
+        for leaves in ("control", "observation"):
+
+            def q(y, chunk_rows=8192, base=base, leaves=leaves):
+                policy = RolloutPolicy(
+                    model, base, trajectories=3, leaves=leaves, chunk_rows=chunk_rows, max_steps=60
+                )
+                return policy.q_factors(y)
+
+            reference = q(y)
+            assert torch.equal(q(y, chunk_rows=1), reference)
+            assert torch.equal(q(y, chunk_rows=100), reference)
+            assert torch.equal(q(y[order]), reference[order])
+            assert torch.equal(q(y[7:8]), reference[7:8])
+            assert torch.equal(q(y.reshape(3, 20)), reference.view(3, 20, 3))
+
+
+def test_seeds_change_the_noise_and_nothing_else_does(linear20):
+    y = linear20.start(torch.arange(20))
+    policies = [RolloutPolicy(linear20.model, GreedyRepair(linear20.model), seed=s) for s in (0, 0, 1)]
+    q = [policy.q_factors(y) for policy in policies]
+    assert torch.equal(q[0], q[1])
+    assert not torch.equal(q[0], q[2])
+
+
+def test_both_kinds_of_leaves_estimate_the_same_q_factors():
+    model = small_model(line(3), dtype=torch.float64)
+    y = model.observe(random_states(model, 5, 1), torch.full((5, 1), 0.4, dtype=torch.float64))
+    greedy = GreedyRepair(model)
+    stratified = RolloutPolicy(model, greedy, trajectories=4000).q_factors(y)
+    exact = RolloutPolicy(model, greedy, trajectories=2000, leaves="observation").q_factors(y)
+    mask = torch.isfinite(exact)
+    torch.testing.assert_close(stratified[mask], exact[mask], rtol=0.02, atol=0.02)
+
+
+def test_q_factors_with_exact_leaves_equal_bellman_by_hand():
+    """With a terminal cost that is the cost-to-go itself (m = 1) equation (1) has no sampling left."""
+    model = tiger()
+    y = TensorDict({"belief": torch.tensor([[0.5, 0.5], [0.9, 0.1]])}, [2])
+    listen = ListenThenOpen(2.0)
+    q = RolloutPolicy(
+        model, listen, trajectories=1, leaves="observation", max_steps=1, terminal_cost=lambda y: y["belief"][..., 0]
+    ).q_factors(y)
+    for row in range(2):
+        for u in range(3):
+            # The mean of the posterior is the predicted belief, here linear in the terminal cost.
+            predicted = y["belief"][row, 0].item() if u == 0 else 0.5
+            stage = float(y["belief"][row] @ model.cost[:, u])
+            assert q[row, u].item() == pytest.approx(stage + 0.95 * (1 + 0.95 * predicted), rel=1e-5)
+
+
+def test_a_rolled_out_first_control_is_really_applied():
+    """Two locations, the robot at an intact one beside total damage: moving there at once is the only sense."""
+    model = RepairModel(line(2), damage_chain((0.0, 0.02, 0.03, 0.05)), COSTS, 0.99)
+    mild_here = torch.tensor([[[0.0, 1.0, 0, 0, 0], [0, 0, 0, 0, 1.0]]])
+    y = TensorDict({"belief": mild_here, "location": torch.zeros(1, 1, dtype=torch.int64)}, [1])
+    policy = RolloutPolicy(model, GreedyRepair(model), trajectories=2)
+    assert GreedyRepair(model)(y.copy())["action"].item() == 0
+    out = policy(y.copy())
+    assert out["action"].item() == 2
+    # By hand: repair first pays 100.1 + 100 + 100, moving first 100.1 + 100.1(…) with level 1 rising slowly.
+    repair_first = 100.1 + 0.99 * 100 + 0.99**2 * 100
+    assert out["q_factors"][0, 0].item() == pytest.approx(repair_first, rel=1e-6)
+    degraded = [torch.tensor([0, 1.0, 0, 0, 0]) @ torch.linalg.matrix_power(model.chain, k) @ model.costs for k in range(5)]
+    move_first = (degraded[0] + 100) + 0.99 * (degraded[1] + 100) + 0.99**2 * degraded[2] + 0.99**3 * degraded[3]
+    assert out["q_factors"][0, 2].item() == pytest.approx(float(move_first), rel=1e-4)
+
+
+def test_rollout_improves_tiger_and_stays_above_the_optimum():
+    model, start = tiger(), FixedBelief(torch.tensor([0.5, 0.5]))
+    base = ListenThenOpen(0.8)
+    rollout = RolloutPolicy(model, base, trajectories=50, max_steps=80)
+    before = estimate(discounted_costs(model, base, start, num_states=1000, max_steps=120))
+    after = estimate(discounted_costs(model, rollout, start, num_states=1000, max_steps=120))
+    assert after.mean + 3 * after.standard_error < before.mean
+    assert after.mean + 3 * after.standard_error > TIGER_OPTIMUM
+    assert abs(after.mean - TIGER_OPTIMUM) < 3 * after.standard_error + 1.0
+
+
+def test_router_with_one_policy_everywhere_changes_nothing(linear20):
+    model, greedy = linear20.model, GreedyRepair(linear20.model)
+    y = linear20.start(torch.arange(30))
+    routed = RolloutPolicy(model, PartitionedPolicy([greedy] * 6), trajectories=3).q_factors(y)
+    copies = RolloutPolicy(model, PartitionedPolicy([GreedyRepair(model) for _ in range(6)]), trajectories=3).q_factors(y)
+    plain = RolloutPolicy(model, greedy, trajectories=3).q_factors(y)
+    assert torch.equal(routed, plain)
+    assert torch.equal(copies, plain)
+
+
+def test_plain_callables_are_policies_too(line3):
+    def first_legal(y):
+        return y.set("action", y["action_mask"].to(torch.int64).argmax(-1))
+
+    y = line3.start(torch.arange(5))
+    cost = TruncatedRollout(line3.model, first_legal, max_steps=10)(y, torch.arange(5))
+    assert (cost > 0).all()
+    assert RolloutPolicy(line3.model, first_legal, trajectories=2)(y)["action"].shape == (5,)
+
+
+def test_bad_arguments_are_refused(line3):
+    greedy = GreedyRepair(line3.model)
+    for name, value in (("trajectories", 0), ("chunk_rows", 0), ("leaves", "tree"), ("max_steps", 0)):
+        with pytest.raises(ValueError, match=name):
+            RolloutPolicy(line3.model, greedy, **{name: value})
+    with pytest.raises(ValueError, match="'belief' of y has shape"):
+        RolloutPolicy(line3.model, greedy)(TensorDict({"belief": torch.ones(2, 3), "location": torch.zeros(2, 1).long()}, [2]))

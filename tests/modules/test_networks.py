@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from _oracles import random_states, small_model
+
+from torchrl_pomdp.envs import grid, line, tiger
+from torchrl_pomdp.modules import FlatEncoder, GreedyRepair, PartitionedPolicy, PolicyNetwork, RelativeEncoder
+
+
+def network(model, seed=0, encoder=FlatEncoder):
+    return PolicyNetwork(encoder(model), model.num_controls, (16, 8), generator=torch.Generator().manual_seed(seed))
+
+
+def test_flat_encoding_holds_beliefs_and_one_hot_location(linear20):
+    y = linear20.start(torch.arange(4))
+    features = FlatEncoder(linear20.model)(y)
+    torch.testing.assert_close(features[:, :100].view(4, 5, 20), y["belief"].transpose(1, 2))
+    assert torch.equal(features[:, 100:].argmax(-1), y["location"][:, 0])
+    assert FlatEncoder(tiger()).num_features == 2
+
+
+def test_relative_encoding_by_hand():
+    model = small_model(line(3), dtype=torch.float32)
+    y = random_states(model, 6, 0)
+    features = RelativeEncoder(model)(y)
+    window = features[:, :15].view(6, 3, 5)
+    for row in range(6):
+        place = int(y["location"][row, 0])
+        for offset in range(-2, 3):
+            seen = window[row, :, offset + 2]
+            if not 0 <= place + offset < 3:
+                assert seen.tolist() == [0, 0, 0]
+                continue
+            belief = y["belief"][row, place + offset]
+            assert torch.equal(seen[:2], belief[1:])
+            assert seen[2] == float(belief[0] < 1)
+    assert torch.equal(features[:, 15:].argmax(-1), y["location"][:, 0])
+
+
+def test_relative_encoding_sees_the_same_from_everywhere():
+    model = small_model(grid(5, 4), dtype=torch.float32)
+    y = random_states(model, 1, 0).expand(2).clone()
+    y["belief"][:] = torch.eye(3)[0]
+    y["location"][:] = torch.tensor([[6], [12]])
+    y["belief"][0, 6 + 1] = y["belief"][1, 12 + 1] = torch.tensor([0.2, 0.3, 0.5])
+    features = RelativeEncoder(model)(y)
+    assert torch.equal(features[0, :-20], features[1, :-20])
+
+
+@pytest.mark.parametrize("encoder", [FlatEncoder, RelativeEncoder])
+@pytest.mark.parametrize("size", [1, 2, 5, 17, 100])
+def test_outputs_do_not_depend_on_the_batch(linear20, encoder, size):
+    policy = network(linear20.model, encoder=encoder)
+    y = linear20.model.with_features(linear20.start(torch.arange(300)))
+    together, apart = policy(y.copy())["logits"], policy(y[100 : 100 + size].clone())["logits"]
+    assert torch.equal(apart, together[100 : 100 + size])
+
+
+def test_initial_weights_come_from_the_generator_alone(linear20):
+    state = torch.random.get_rng_state()
+    first, second, other = (network(linear20.model, seed).state_dict() for seed in (0, 0, 1))
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert all(torch.equal(first[key], second[key]) for key in first)
+    assert not all(torch.equal(first[key], other[key]) for key in first)
+
+
+def test_router_gives_every_row_its_own_parts_answer(linear20):
+    model = linear20.model
+    policies = [network(model, seed) for seed in range(5)] + [GreedyRepair(model)]
+    router = PartitionedPolicy(policies)
+    y = torch.cat([generator(torch.arange(5)) for generator in linear20.training])
+    y = model.with_features(y[torch.randperm(30, generator=torch.Generator().manual_seed(0))])
+    u = router(y.copy())["action"]
+    for row in range(30):
+        alone = policies[int(y["partition"][row])](y[row : row + 1].clone())["action"]
+        assert u[row] == alone[0]
+    assert torch.equal(router(y.reshape(5, 6).clone())["action"], u.view(5, 6))
+    assert router.out_keys == ["action"], "the greedy policy has no logits"
+
+
+def test_gradients_reach_the_networks_of_the_rows_parts_alone(linear20):
+    model = linear20.model
+    router = PartitionedPolicy([network(model, seed) for seed in range(6)])
+    y = model.with_features(linear20.training[2](torch.arange(8)))
+    logits = router(y)["logits"]
+    logits[torch.isfinite(logits)].sum().backward()
+    touched = [any(p.grad is not None for p in policy.parameters()) for policy in router.policies]
+    assert touched == [False, False, True, False, False, False]
+
+
+def test_router_refuses_parts_without_a_policy(linear20):
+    y = linear20.model.with_features(linear20.start(torch.arange(3))).set("partition", torch.tensor([0, 1, 6]))
+    with pytest.raises(ValueError, match=r"partition must hold parts 0\.\.5"):
+        PartitionedPolicy([GreedyRepair(linear20.model)] * 6)(y)
+    with pytest.raises(ValueError, match="policies is empty"):
+        PartitionedPolicy([])

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import csv
+import json
+
+import pytest
+import torch
+
+from torchrl_pomdp.cli import main
+from torchrl_pomdp.envs import BeliefEnv
+from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
+from torchrl_pomdp.modules import GreedyRepair
+from torchrl_pomdp.report import trajectory_figure
+from torchrl_pomdp.trainers.checkpoint import write_atomically
+
+TINY = "--iterations 1 --samples-per-part 60 --trajectories 2 --epochs 1 --batch-size 30 --max-steps 60 --states 20"
+
+
+def test_train_and_evaluate(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(["train", "line3", *TINY.split(), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "line of 3, 1 robot: 3.8e+02 states" in text
+    assert "| pAPI-NT 1 |" in text
+    config = json.loads((out / "config.json").read_text())
+    assert (config["problem"], config["samples_per_part"]) == ("line3", 60)
+    with (out / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["policy"] for row in rows] == ["greedy", "R-NT", "pAPI-NT 1"]
+    assert float(rows[0]["ratio"]) == 1.0
+    for name in ("costs.png", "trajectory.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
+    assert main(["evaluate", str(out / "iteration-1.pt"), "--states", "20"]) == 0
+    again = capsys.readouterr().out
+    expected = float(rows[2]["ratio"])
+    assert f"| {expected:.3f} |" in again, "a checkpoint evaluates to what the run reported"
+    before = {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    assert main(["train", "line3", "--out", str(out)]) == 2
+    assert "is in use" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize("policy", ["greedy", "rollout"])
+def test_evaluate_by_name(policy, capsys):
+    assert main(["evaluate", policy, "--problem", "line3", "--states", "10"]) == 0
+    assert "| greedy |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["train", "linear21"], "unknown preset 'linear21'; known presets: line3, linear20"),
+        (["evaluate", "nowhere.pt"], "there is no checkpoint nowhere.pt"),
+        (["evaluate", "greedy", "--states", "0"], "num_states must be at least 1"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(args, message, capsys):
+    assert main(args) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_estimates_by_hand():
+    values = torch.tensor([1.0, 2.0, 3.0, 6.0])
+    assert estimate(values).mean == 3.0
+    assert estimate(values).standard_error == pytest.approx((14 / 3) ** 0.5 / 2)
+    comparison = compare(torch.tensor([8.0, 12.0]), torch.tensor([10.0, 10.0]))
+    assert comparison.difference.mean == 0.0
+    assert comparison.ratio.mean == 1.0
+    assert comparison.ratio.standard_error == pytest.approx(0.2)
+    with pytest.raises(ValueError, match="paired"):
+        compare(torch.ones(2), torch.ones(3))
+
+
+def test_evaluation_is_paired_by_state(linear20):
+    greedy = GreedyRepair(linear20.model)
+    few = discounted_costs(linear20.model, greedy, linear20.start, num_states=10)
+    many = discounted_costs(linear20.model, greedy, linear20.start, num_states=300)
+    assert torch.equal(few, many[:10])
+
+
+def test_trajectory_picture_has_every_stage_and_repair(linear20):
+    env = BeliefEnv(linear20.model, linear20.start)
+    trajectory = env.rollout(30, GreedyRepair(linear20.model))
+    figure = trajectory_figure(linear20.model, trajectory)
+    axes = figure.axes[0]
+    assert axes.images[0].get_array().shape == (20, 30)
+    assert len(axes.collections[0].get_offsets()) == int((trajectory["action"] == 0).sum())
+    assert axes.lines[0].get_ydata().tolist() == trajectory["location"][:, 0].tolist()
+
+
+def test_failed_writes_leave_the_old_file(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def fail(temporary):
+        temporary.write_text("half")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, fail)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
