@@ -123,4 +123,3 @@ def brute_force(model: RepairModel, belief: torch.Tensor, location: list[int], c
             for i, level in enumerate(nxt):
                 marginal[i, level] += weight
     return cost, z_probs, {z: m / z_probs[z] for z, m in posterior.items()}, after
-

@@ -79,9 +79,7 @@ class Evaluate:
 def main(args: list[str] | None = None) -> int:
     """Run the command with ``args`` (default: the process's); returns the exit status, 2 for input that was refused."""
     torchrl_logger.setLevel("WARNING")
-    commands = (
-        Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    )
+    commands = Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     command: Train | Evaluate = tyro.cli(commands, prog="torchrl-pomdp", args=args)  # type: ignore[arg-type]
     try:
         _train(command) if isinstance(command, Train) else _evaluate(command)
@@ -96,7 +94,9 @@ def _train(command: Train) -> None:
     config = command.config
     out = create_run_folder(command.out or Path("runs") / f"{problem.name}-seed{config.seed}")
     print(f"{problem.name}: {problem.model.describe()}\nrun folder: {out}")
-    _write_json(out / "config.json", {"problem": problem.name, "base_policy": "greedy", **asdict(config), **_versions()})
+    _write_json(
+        out / "config.json", {"problem": problem.name, "base_policy": "greedy", **asdict(config), **_versions()}
+    )
     greedy = GreedyRepair(problem.model)
     baseline = _costs(problem, greedy, command.states, "greedy")
     results = [Result("greedy", compare(baseline, baseline))]

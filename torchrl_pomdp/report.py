@@ -58,9 +58,7 @@ def write_metrics(path: Path, results: Sequence[Result]) -> None:
     """Write results as CSV, one policy a row; means, standard errors and sample sizes."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(
-            ["policy", "states", "cost", "cost_se", "difference", "difference_se", "ratio", "ratio_se"]
-        )
+        writer.writerow(["policy", "states", "cost", "cost_se", "difference", "difference_se", "ratio", "ratio_se"])
         for result in results:
             c = result.comparison
             estimates = (c.cost, c.difference, c.ratio)

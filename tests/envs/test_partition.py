@@ -8,7 +8,16 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from torchrl_pomdp.collectors import Mixture, PartSampler, VisitedStates
-from torchrl_pomdp.envs import CalibratedStart, InPart, RandomState, RepairPartition, SinglePart, grid, line, make_problem
+from torchrl_pomdp.envs import (
+    CalibratedStart,
+    InPart,
+    RandomState,
+    RepairPartition,
+    SinglePart,
+    grid,
+    line,
+    make_problem,
+)
 from torchrl_pomdp.modules import GreedyRepair
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 

@@ -16,7 +16,9 @@ TRIANGLE = Graph.from_edges("triangle with a tail", 4, [(0, 1), (1, 2), (2, 0), 
 
 @given(
     seed=st.integers(0, 10_000),
-    case=st.sampled_from([(line(3), 1, (0.0, 0.3)), (line(3), 2, (0.2, 0.3)), (TRIANGLE, 1, (0.0, 0.3)), (line(2), 3, (0.1, 0.4))]),
+    case=st.sampled_from(
+        [(line(3), 1, (0.0, 0.3)), (line(3), 2, (0.2, 0.3)), (TRIANGLE, 1, (0.0, 0.3)), (line(2), 3, (0.1, 0.4))]
+    ),
 )
 @settings(max_examples=60, deadline=None)
 def test_cost_observations_and_estimator_equal_brute_force_bayes(seed, case):

@@ -30,7 +30,9 @@ def test_equals_bayes_written_out(seed, u):
     belief = torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     belief = belief / belief.sum()
     y, control = TensorDict({"belief": belief.unsqueeze(0)}, [1]), torch.tensor([u])
-    assert model.expected_cost(y, control).item() == pytest.approx(sum(float(belief[i] * model.cost[i, u]) for i in range(4)))
+    assert model.expected_cost(y, control).item() == pytest.approx(
+        sum(float(belief[i] * model.cost[i, u]) for i in range(4))
+    )
     for z in range(3):
         joint = [
             sum(float(belief[i] * model.transition[u, i, j]) for i in range(4)) * float(model.observation[u, j, z])

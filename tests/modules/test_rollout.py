@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from _oracles import LINE3_OPTIMUM, LINE3_OPTIMUM_BY_START_LEVEL, COSTS, Memo, line3_cost
+from _oracles import COSTS, LINE3_OPTIMUM, LINE3_OPTIMUM_BY_START_LEVEL, Memo, line3_cost
 from tensordict import TensorDict
 
 from torchrl_pomdp.envs import (
@@ -99,7 +99,9 @@ class _NaiveRollout:
         model, n = self.model, self.trajectories
         state, control = y["action_mask"].nonzero(as_tuple=True)
         rows = model.with_features(y[state]).unsqueeze(1).expand(-1, n).reshape(-1).clone()
-        levels = torch.multinomial(rows["belief"].reshape(-1, 5), 1, generator=self.generator).view(-1, model.num_locations)
+        levels = torch.multinomial(rows["belief"].reshape(-1, 5), 1, generator=self.generator).view(
+            -1, model.num_locations
+        )
         cost, u, discount = torch.zeros(len(levels)), control.repeat_interleave(n), 1.0
         for _ in range(120):
             cost += discount * model.costs[levels].sum(-1)
@@ -139,7 +141,9 @@ def test_a_cut_rollout_adds_the_discounted_terminal_cost():
 def test_terminal_states_cost_nothing_not_even_the_terminal_cost(line3):
     y = line3.start(torch.arange(6))
     y["belief"][:] = torch.eye(5)[0]
-    rollout = TruncatedRollout(line3.model, GreedyRepair(line3.model), max_steps=3, terminal_cost=lambda y: y["belief"].sum((-1, -2)))
+    rollout = TruncatedRollout(
+        line3.model, GreedyRepair(line3.model), max_steps=3, terminal_cost=lambda y: y["belief"].sum((-1, -2))
+    )
     assert rollout(y, torch.arange(6)).tolist() == [0.0] * 6
 
 

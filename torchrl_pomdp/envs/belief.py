@@ -154,9 +154,7 @@ class BeliefModel(nn.Module, ABC):
         Returns:
             a new TensorDict ``[*B]``; the entries of ``y`` are shared, not copied.
         """
-        result = TensorDict(
-            {key: y.get(key) for key in self.state_keys}, batch_size=y.batch_size, device=self.device
-        )
+        result = TensorDict({key: y.get(key) for key in self.state_keys}, batch_size=y.batch_size, device=self.device)
         if keys is None or "action_mask" in keys:
             result.set("action_mask", self.action_mask(result))
         if self.partition is not None and (keys is None or "partition" in keys):

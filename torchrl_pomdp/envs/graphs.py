@@ -88,7 +88,9 @@ class Graph:
         adjacent: list[set[int]] = [set() for _ in range(num_locations)]
         for a, b in edges:
             if not (0 <= a < num_locations and 0 <= b < num_locations) or a == b:
-                raise ValueError(f"edges holds {(a, b)}, allowed are pairs of different locations 0..{num_locations - 1}")
+                raise ValueError(
+                    f"edges holds {(a, b)}, allowed are pairs of different locations 0..{num_locations - 1}"
+                )
             adjacent[a].add(b)
             adjacent[b].add(a)
         degree = max((len(nodes) for nodes in adjacent), default=0)

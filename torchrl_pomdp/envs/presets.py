@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
+from torchrl_pomdp.envs.belief import StateGenerator
 from torchrl_pomdp.envs.generators import CalibratedStart, InPart, RandomState, UniformStart
 from torchrl_pomdp.envs.graphs import Graph, line
 from torchrl_pomdp.envs.partition import RepairPartition

@@ -357,6 +357,8 @@ def _check_chain(chain: Tensor) -> None:
 
 def _check_costs(costs: Tensor, num_levels: int) -> None:
     if costs.shape != (num_levels,):
-        raise ValueError(f"costs must have shape ({num_levels},), one for each level of chain, got {tuple(costs.shape)}")
+        raise ValueError(
+            f"costs must have shape ({num_levels},), one for each level of chain, got {tuple(costs.shape)}"
+        )
     if not bool((torch.isfinite(costs) & (costs >= 0)).all()):
         raise ValueError(f"costs must be finite and nonnegative, got {costs.tolist()}")

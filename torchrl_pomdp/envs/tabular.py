@@ -134,4 +134,6 @@ def _check_rows(name: str, array: Tensor) -> None:
     if not bool((array >= 0).all()) or not bool(((sums - 1.0).abs() <= 1e-5).all()):
         worst = int((sums - 1.0).abs().argmax())
         where = tuple(int(i) for i in torch.unravel_index(torch.tensor(worst), sums.shape))
-        raise ValueError(f"rows of {name} must be nonnegative and sum to 1; row {where} sums to {float(sums[where]):.6g}")
+        raise ValueError(
+            f"rows of {name} must be nonnegative and sum to 1; row {where} sums to {float(sums[where]):.6g}"
+        )

@@ -129,9 +129,11 @@ class RolloutPolicy(TensorDictModuleBase):
             pair, observation = (probs > 0).nonzero(as_tuple=True)
             weight = probs[pair, observation] / count
             each = self._trajectory_index.repeat(pair.numel())
-            return _Leaves(*(x.repeat_interleave(count) for x in (pair,)), each, *(
-                x.repeat_interleave(count) for x in (observation, weight)
-            ))
+            return _Leaves(
+                *(x.repeat_interleave(count) for x in (pair,)),
+                each,
+                *(x.repeat_interleave(count) for x in (observation, weight)),
+            )
         # Trajectory j draws from the j-th of n equal slices of the distribution function.
         noise = (self._trajectory_index + uniform(keys, 0)) / count
         observation = inverse_cdf(probs.unsqueeze(1).expand(-1, count, -1), noise)
