@@ -27,9 +27,7 @@ def random_states(model: RepairModel, count: int, seed: int) -> TensorDict:
     generator = torch.Generator().manual_seed(seed)
     shape = (count, model.num_locations, model.num_levels)
     belief = torch.rand(shape, generator=generator, dtype=model.dtype) ** 2
-    certain = torch.eye(model.num_levels, dtype=model.dtype)[
-        torch.randint(model.num_levels, shape[:2], generator=generator)
-    ]
+    certain = torch.eye(model.num_levels, dtype=model.dtype)[torch.randint(model.num_levels, shape[:2], generator=generator)]
     belief = torch.where(torch.rand(shape[:2], generator=generator).unsqueeze(-1) < 0.4, certain, belief)
     location = torch.randint(model.num_locations, (count, model.num_robots), generator=generator)
     return TensorDict({"belief": belief / belief.sum(-1, keepdim=True), "location": location}, [count])

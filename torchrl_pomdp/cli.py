@@ -8,7 +8,7 @@ import sys
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
@@ -80,7 +80,7 @@ def main(args: list[str] | None = None) -> int:
     """Run the command with ``args`` (default: the process's); returns the exit status, 2 for input that was refused."""
     torchrl_logger.setLevel("WARNING")
     commands = Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    command: Train | Evaluate = tyro.cli(commands, prog="torchrl-pomdp", args=args)  # type: ignore[arg-type]
+    command: Train | Evaluate = tyro.cli(commands, prog="torchrl-pomdp", args=args)
     try:
         _train(command) if isinstance(command, Train) else _evaluate(command)
     except ValueError as error:
@@ -94,16 +94,14 @@ def _train(command: Train) -> None:
     config = command.config
     out = create_run_folder(command.out or Path("runs") / f"{problem.name}-seed{config.seed}")
     print(f"{problem.name}: {problem.model.describe()}\nrun folder: {out}")
-    _write_json(
-        out / "config.json", {"problem": problem.name, "base_policy": "greedy", **asdict(config), **_versions()}
-    )
+    _write_json(out / "config.json", {"problem": problem.name, "base_policy": "greedy", **asdict(config), **_versions()})
     greedy = GreedyRepair(problem.model)
     baseline = _costs(problem, greedy, command.states, "greedy")
     results = [Result("greedy", compare(baseline, baseline))]
     rollout = RolloutPolicy(problem.model, greedy)
     _add(results, "R-NT", _costs(problem, rollout, command.states, "R-NT"), baseline, problem, out)
     logger = CSVLogger("log", log_dir=str(out))
-    best: tuple[float, Policy] = (results[0].comparison.cost.mean, greedy)
+    best: tuple[float, Any] = (results[0].comparison.cost.mean, greedy)
     for number, policy in enumerate(PolicyIteration(problem, config, greedy, logger=logger, progress=True), start=1):
         save_checkpoint(out / f"iteration-{number}.pt", Checkpoint(problem, config, number, policy))
         name = f"pAPI-NT {number}"

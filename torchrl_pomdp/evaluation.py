@@ -130,9 +130,7 @@ def compare(costs: Tensor, baseline: Tensor) -> Comparison:
         Estimate(mean=0.9, standard_error=0.0, count=2)
     """
     if costs.shape != baseline.shape:
-        raise ValueError(
-            f"costs and baseline must be paired, got shapes {tuple(costs.shape)} and {tuple(baseline.shape)}"
-        )
+        raise ValueError(f"costs and baseline must be paired, got shapes {tuple(costs.shape)} and {tuple(baseline.shape)}")
     costs, baseline = costs.double(), baseline.double()
     mean = baseline.mean()
     ratio = float(costs.mean() / mean)

@@ -6,9 +6,7 @@ import torch
 from torchrl_pomdp.envs import Graph, grid, line
 
 
-@pytest.mark.parametrize(
-    "graph", [line(7), grid(4, 3), Graph.from_edges("ring", 5, [(i, (i + 1) % 5) for i in range(5)])]
-)
+@pytest.mark.parametrize("graph", [line(7), grid(4, 3), Graph.from_edges("ring", 5, [(i, (i + 1) % 5) for i in range(5)])])
 def test_distances_and_first_controls_agree(graph):
     size = graph.num_locations
     assert torch.equal(graph.distances, graph.distances.T)

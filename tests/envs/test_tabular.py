@@ -18,9 +18,7 @@ def random_model(seed, controls=2, states=4, observations=3):
         return values / values.sum(-1, keepdim=True)
 
     cost = torch.rand(states, controls, generator=generator, dtype=torch.float64)
-    return TabularModel(
-        rows(controls, states, states), rows(controls, states, observations), cost, 0.9, dtype=torch.float64
-    )
+    return TabularModel(rows(controls, states, states), rows(controls, states, observations), cost, 0.9, dtype=torch.float64)
 
 
 @given(seed=st.integers(0, 10_000), u=st.integers(0, 1))
@@ -30,9 +28,7 @@ def test_equals_bayes_written_out(seed, u):
     belief = torch.rand(4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     belief = belief / belief.sum()
     y, control = TensorDict({"belief": belief.unsqueeze(0)}, [1]), torch.tensor([u])
-    assert model.expected_cost(y, control).item() == pytest.approx(
-        sum(float(belief[i] * model.cost[i, u]) for i in range(4))
-    )
+    assert model.expected_cost(y, control).item() == pytest.approx(sum(float(belief[i] * model.cost[i, u]) for i in range(4)))
     for z in range(3):
         joint = [
             sum(float(belief[i] * model.transition[u, i, j]) for i in range(4)) * float(model.observation[u, j, z])

@@ -38,9 +38,7 @@ class ListenThenOpen:
 
 def networks(model, seed):
     generator = torch.Generator().manual_seed(seed)
-    return [
-        PolicyNetwork(e(model), model.num_controls, (8,), generator=generator) for e in (FlatEncoder, RelativeEncoder)
-    ]
+    return [PolicyNetwork(e(model), model.num_controls, (8,), generator=generator) for e in (FlatEncoder, RelativeEncoder)]
 
 
 @given(seed=st.integers(0, 10_000), robots=st.sampled_from([1, 2]))
@@ -137,9 +135,7 @@ def test_a_rolled_out_first_control_is_really_applied():
     # By hand: repair first pays 100.1 + 100 + 100, moving first 100.1 + 100.1(…) with level 1 rising slowly.
     repair_first = 100.1 + 0.99 * 100 + 0.99**2 * 100
     assert out["q_factors"][0, 0].item() == pytest.approx(repair_first, rel=1e-6)
-    degraded = [
-        torch.tensor([0, 1.0, 0, 0, 0]) @ torch.linalg.matrix_power(model.chain, k) @ model.costs for k in range(5)
-    ]
+    degraded = [torch.tensor([0, 1.0, 0, 0, 0]) @ torch.linalg.matrix_power(model.chain, k) @ model.costs for k in range(5)]
     move_first = (degraded[0] + 100) + 0.99 * (degraded[1] + 100) + 0.99**2 * degraded[2] + 0.99**3 * degraded[3]
     assert out["q_factors"][0, 2].item() == pytest.approx(float(move_first), rel=1e-4)
 
@@ -159,9 +155,7 @@ def test_router_with_one_policy_everywhere_changes_nothing(linear20):
     model, greedy = linear20.model, GreedyRepair(linear20.model)
     y = linear20.start(torch.arange(30))
     routed = RolloutPolicy(model, PartitionedPolicy([greedy] * 6), trajectories=3).q_factors(y)
-    copies = RolloutPolicy(model, PartitionedPolicy([GreedyRepair(model) for _ in range(6)]), trajectories=3).q_factors(
-        y
-    )
+    copies = RolloutPolicy(model, PartitionedPolicy([GreedyRepair(model) for _ in range(6)]), trajectories=3).q_factors(y)
     plain = RolloutPolicy(model, greedy, trajectories=3).q_factors(y)
     assert torch.equal(routed, plain)
     assert torch.equal(copies, plain)
@@ -183,6 +177,4 @@ def test_bad_arguments_are_refused(line3):
         with pytest.raises(ValueError, match=name):
             RolloutPolicy(line3.model, greedy, **{name: value})
     with pytest.raises(ValueError, match="'belief' of y has shape"):
-        RolloutPolicy(line3.model, greedy)(
-            TensorDict({"belief": torch.ones(2, 3), "location": torch.zeros(2, 1).long()}, [2])
-        )
+        RolloutPolicy(line3.model, greedy)(TensorDict({"belief": torch.ones(2, 3), "location": torch.zeros(2, 1).long()}, [2]))

@@ -99,9 +99,7 @@ class _NaiveRollout:
         model, n = self.model, self.trajectories
         state, control = y["action_mask"].nonzero(as_tuple=True)
         rows = model.with_features(y[state]).unsqueeze(1).expand(-1, n).reshape(-1).clone()
-        levels = torch.multinomial(rows["belief"].reshape(-1, 5), 1, generator=self.generator).view(
-            -1, model.num_locations
-        )
+        levels = torch.multinomial(rows["belief"].reshape(-1, 5), 1, generator=self.generator).view(-1, model.num_locations)
         cost, u, discount = torch.zeros(len(levels)), control.repeat_interleave(n), 1.0
         for _ in range(120):
             cost += discount * model.costs[levels].sum(-1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -75,7 +76,7 @@ class RolloutImprovement(Collector):
         label: Callable[..., RolloutPolicy] = RolloutPolicy,
         num_workers: int = 1,
         progress: bool = False,
-        **kwargs,
+        **kwargs: Any,
     ) -> None:
         if num_workers < 1:
             raise ValueError(f"num_workers must be at least 1, got {num_workers}")
@@ -109,14 +110,14 @@ class RolloutImprovement(Collector):
                 for y in self.env.model.with_features(self.states(numbers)).split(_LABELLED):
                     blocks.append(self.labeller(y))
                     bar.update(y.batch_size.numel())
-        batch = torch.cat(blocks)
+        batch: Any = torch.cat(blocks, 0)
         return batch.set(("collector", "mask"), torch.ones(size, dtype=torch.bool, device=batch.device))
 
-    def state_dict(self):
+    def state_dict(self) -> dict[str, Any]:
         """State of the base policy and the number of batches made."""
         return {**super().state_dict(), "batches": self._batches}
 
-    def load_state_dict(self, state_dict, **kwargs) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any], **kwargs: Any) -> None:
         """Continue after the batch at which ``state_dict`` was taken."""
         state = dict(state_dict)
         self._batches = state.pop("batches")

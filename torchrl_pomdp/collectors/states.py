@@ -71,9 +71,7 @@ class Mixture:
 
     def __init__(self, generators: Sequence[StateGenerator], weights: Sequence[float]) -> None:
         if len(generators) != len(weights) or not generators or min(weights) < 0 or sum(weights) <= 0:
-            raise ValueError(
-                f"weights must be {len(generators)} nonnegative numbers with positive sum, got {list(weights)}"
-            )
+            raise ValueError(f"weights must be {len(generators)} nonnegative numbers with positive sum, got {list(weights)}")
         self.generators, self.weights = list(generators), torch.tensor(weights, dtype=torch.float32)
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
@@ -150,9 +148,7 @@ class VisitedStates:
             _, y = model.advance(y, u, step_noise(fold(flat[live], _STEPS), step, model.noise_dim))
         return picked.view(keys.shape)
 
-    def _pick(
-        self, picked: TensorDictBase, seen: Tensor, y: TensorDictBase, live: Tensor, keys: Tensor, step: int
-    ) -> None:
+    def _pick(self, picked: TensorDictBase, seen: Tensor, y: TensorDictBase, live: Tensor, keys: Tensor, step: int) -> None:
         """Reservoir sampling: the n-th eligible state of a trajectory replaces the picked one with probability 1/n."""
         eligible = live if self.part is None else live[y.get("partition") == self.part]
         seen[eligible] += 1

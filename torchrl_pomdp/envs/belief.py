@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -175,13 +176,9 @@ class BeliefModel(nn.Module, ABC):
         """Specs of core and derived entries."""
         spec = self.state_spec(batch_size)
         shape = torch.Size(batch_size)
-        spec["action_mask"] = Binary(
-            self.num_controls, shape=(*shape, self.num_controls), dtype=torch.bool, device=self.device
-        )
+        spec["action_mask"] = Binary(self.num_controls, shape=(*shape, self.num_controls), dtype=torch.bool, device=self.device)
         if self.partition is not None:
-            spec["partition"] = Categorical(
-                self.partition.num_parts, shape=shape, dtype=torch.int64, device=self.device
-            )
+            spec["partition"] = Categorical(self.partition.num_parts, shape=shape, dtype=torch.int64, device=self.device)
         return spec
 
     def check_state(self, y: TensorDictBase) -> None:
@@ -281,8 +278,7 @@ class BeliefEnv(EnvBase):
         self.action_spec = Categorical(self.model.num_controls, shape=shape, dtype=torch.int64, device=device)
         self.reward_spec = Composite(reward=Unbounded(shape=(*shape, 1), device=device), shape=shape)
         flags = {
-            key: Binary(1, shape=(*shape, 1), dtype=torch.bool, device=device)
-            for key in ("done", "terminated", "truncated")
+            key: Binary(1, shape=(*shape, 1), dtype=torch.bool, device=device) for key in ("done", "terminated", "truncated")
         }
         self.full_done_spec = Composite(flags, shape=shape, device=device)
 
@@ -291,14 +287,14 @@ class BeliefEnv(EnvBase):
         if seed is not None:
             self.rng.manual_seed(seed)
 
-    def to(self, *args, **kwargs):
+    def to(self, *args: Any, **kwargs: Any) -> BeliefEnv:
         """Refused: build the model on the device and the environment over it."""
         device = torch._C._nn._parse_to(*args, **kwargs)[0]
         if device is None or device == self.device:
             return self
         raise ValueError(f"the environment lives on its model's device {self.device}; build the model on {device}")
 
-    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         shape = self.batch_size if tensordict is None else tensordict.batch_size
         if set_state and tensordict is not None:
             self.model.check_state(tensordict)
@@ -318,9 +314,7 @@ class BeliefEnv(EnvBase):
 
     def _check_legal(self, y: TensorDictBase, u: Tensor) -> None:
         if u.shape != y.batch_size or u.dtype != torch.int64:
-            raise ValueError(
-                f"action must be int64 of shape {tuple(y.batch_size)}, got {u.dtype} of shape {tuple(u.shape)}"
-            )
+            raise ValueError(f"action must be int64 of shape {tuple(y.batch_size)}, got {u.dtype} of shape {tuple(u.shape)}")
         known = (u >= 0) & (u < self.model.num_controls)
         index = u.clamp(0, self.model.num_controls - 1).unsqueeze(-1)
         legal = known & y.get("action_mask").gather(-1, index).squeeze(-1)

@@ -88,9 +88,7 @@ class Graph:
         adjacent: list[set[int]] = [set() for _ in range(num_locations)]
         for a, b in edges:
             if not (0 <= a < num_locations and 0 <= b < num_locations) or a == b:
-                raise ValueError(
-                    f"edges holds {(a, b)}, allowed are pairs of different locations 0..{num_locations - 1}"
-                )
+                raise ValueError(f"edges holds {(a, b)}, allowed are pairs of different locations 0..{num_locations - 1}")
             adjacent[a].add(b)
             adjacent[b].add(a)
         degree = max((len(nodes) for nodes in adjacent), default=0)
@@ -124,9 +122,7 @@ def line(num_locations: int) -> Graph:
     """
     _check_positive(num_locations=num_locations)
     table = [[i - 1, i + 1 if i + 1 < num_locations else -1] for i in range(num_locations)]
-    return Graph.from_slots(
-        f"line of {num_locations}", table, ("left", "right"), range(num_locations), [0] * num_locations
-    )
+    return Graph.from_slots(f"line of {num_locations}", table, ("left", "right"), range(num_locations), [0] * num_locations)
 
 
 def grid(width: int, height: int) -> Graph:

@@ -88,6 +88,8 @@ class RepairModel(BeliefModel):
     costs: Tensor
     destinations: Tensor
     first_controls: Tensor
+    _levels: Tensor
+    _cost_row: Tensor
 
     def __init__(
         self,
@@ -161,9 +163,7 @@ class RepairModel(BeliefModel):
         belief = (*shape, self.num_locations, self.num_levels)
         return Composite(
             belief=Bounded(0.0, 1.0, shape=belief, dtype=self.dtype, device=self.device),
-            location=Categorical(
-                self.num_locations, shape=(*shape, self.num_robots), dtype=torch.int64, device=self.device
-            ),
+            location=Categorical(self.num_locations, shape=(*shape, self.num_robots), dtype=torch.int64, device=self.device),
             shape=shape,
             device=self.device,
         )
@@ -221,7 +221,7 @@ class RepairModel(BeliefModel):
         for robot in range(self.num_robots):
             # A repaired location is at level 0 for every robot that stands there; a repairing robot has not moved.
             levels = self._levels_at(planes, location[robot])
-            intact = (self._levels == 0).to(self.dtype)
+            intact = torch.eq(self._levels, 0).to(self.dtype)
             self._put(planes, location[robot], torch.where(repaired[robot], intact, levels))
         digits = _digits(torch.arange(self.num_observations, device=self.device), self.num_levels, self.num_robots)
         joint = torch.ones(self.num_observations, planes.shape[-1], dtype=self.dtype, device=self.device)
@@ -299,7 +299,7 @@ class RepairModel(BeliefModel):
 
     def _set_level(self, planes: Tensor, location: Tensor, level: Tensor) -> None:
         """Make ``level`` ``[N]`` certain at ``location`` ``[N]``, in place."""
-        self._put(planes, location, (self._levels == level).to(self.dtype))
+        self._put(planes, location, torch.eq(self._levels, level).to(self.dtype))
 
     def _levels_at(self, planes: Tensor, location: Tensor) -> Tensor:
         """Marginal ``[K, N]`` of each row's ``location`` ``[N]``."""
@@ -357,8 +357,6 @@ def _check_chain(chain: Tensor) -> None:
 
 def _check_costs(costs: Tensor, num_levels: int) -> None:
     if costs.shape != (num_levels,):
-        raise ValueError(
-            f"costs must have shape ({num_levels},), one for each level of chain, got {tuple(costs.shape)}"
-        )
+        raise ValueError(f"costs must have shape ({num_levels},), one for each level of chain, got {tuple(costs.shape)}")
     if not bool((torch.isfinite(costs) & (costs >= 0)).all()):
         raise ValueError(f"costs must be finite and nonnegative, got {costs.tolist()}")

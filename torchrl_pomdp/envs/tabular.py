@@ -63,9 +63,7 @@ class TabularModel(BeliefModel):
                 f"observation must have shape [{self.num_controls}, {self.num_states}, Z], got {tuple(observation.shape)}"
             )
         if cost.shape != (self.num_states, self.num_controls) or not bool(torch.isfinite(cost).all()):
-            raise ValueError(
-                f"cost must be finite of shape [{self.num_states}, {self.num_controls}], got {tuple(cost.shape)}"
-            )
+            raise ValueError(f"cost must be finite of shape [{self.num_states}, {self.num_controls}], got {tuple(cost.shape)}")
         self.num_observations = observation.shape[-1]
         for name, array in (("transition", transition), ("observation", observation)):
             _check_rows(name, array)
@@ -134,6 +132,4 @@ def _check_rows(name: str, array: Tensor) -> None:
     if not bool((array >= 0).all()) or not bool(((sums - 1.0).abs() <= 1e-5).all()):
         worst = int((sums - 1.0).abs().argmax())
         where = tuple(int(i) for i in torch.unravel_index(torch.tensor(worst), sums.shape))
-        raise ValueError(
-            f"rows of {name} must be nonnegative and sum to 1; row {where} sums to {float(sums[where]):.6g}"
-        )
+        raise ValueError(f"rows of {name} must be nonnegative and sum to 1; row {where} sums to {float(sums[where]):.6g}")

@@ -130,9 +130,10 @@ class RolloutPolicy(TensorDictModuleBase):
             weight = probs[pair, observation] / count
             each = self._trajectory_index.repeat(pair.numel())
             return _Leaves(
-                *(x.repeat_interleave(count) for x in (pair,)),
+                pair.repeat_interleave(count),
                 each,
-                *(x.repeat_interleave(count) for x in (observation, weight)),
+                observation.repeat_interleave(count),
+                weight.repeat_interleave(count),
             )
         # Trajectory j draws from the j-th of n equal slices of the distribution function.
         noise = (self._trajectory_index + uniform(keys, 0)) / count

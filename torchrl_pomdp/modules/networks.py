@@ -3,6 +3,7 @@ r"""Encoders of the feature state and the policy network :math:`\hat\mu(y,r)` (p
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from tensordict import TensorDictBase
@@ -154,7 +155,7 @@ class PolicyNetwork(TensorDictModuleBase):
 def _relu_network(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequential:
     """Linear layers of the given sizes with ReLU between them, PyTorch's default initialisation from ``generator``."""
     layers: list[nn.Module] = []
-    for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+    for fan_in, fan_out in pairwise(sizes):
         layer = nn.utils.skip_init(nn.Linear, fan_in, fan_out, device=generator.device)
         for parameter in layer.parameters():
             nn.init.uniform_(parameter, -(fan_in**-0.5), fan_in**-0.5, generator=generator)

@@ -42,9 +42,7 @@ class PartitionedPolicy(TensorDictModuleBase):
         self.policies = nn.ModuleList(policies)
         # A policy that is local to several parts is called once for all of them.
         self._distinct = list(dict.fromkeys(policies))
-        self.register_buffer(
-            "_policy_of_part", torch.tensor([self._distinct.index(p) for p in policies]), persistent=False
-        )
+        self.register_buffer("_policy_of_part", torch.tensor([self._distinct.index(p) for p in policies]), persistent=False)
         read = {str(key): None for policy in policies for key in policy.in_keys}
         self.in_keys = [*read, "partition"]
         written = [set(policy.out_keys) for policy in policies]

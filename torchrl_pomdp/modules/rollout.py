@@ -101,9 +101,7 @@ class TruncatedRollout(nn.Module):
             total.index_add_(0, live, rest, alpha=discount)
         return total
 
-    def _drop_finished(
-        self, y: TensorDictBase, keys: Tensor, live: Tensor
-    ) -> tuple[TensorDictBase, Tensor, Tensor, Tensor]:
+    def _drop_finished(self, y: TensorDictBase, keys: Tensor, live: Tensor) -> tuple[TensorDictBase, Tensor, Tensor, Tensor]:
         """Drop terminal rows once they are many; also returns which of the rows left are terminal."""
         ended = self.model.is_terminal(y)
         count = int(ended.sum())

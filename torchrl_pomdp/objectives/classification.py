@@ -68,11 +68,11 @@ class ClassificationLoss(LossModule):
         super().__init__()
         if loss not in _LOSSES:
             raise ValueError(f"loss must be one of {sorted(_LOSSES)}, got {loss!r}")
-        self._in_keys = None
+        self._in_keys: list[NestedKey] | None = None
         self.loss = loss
         self.convert_to_functional(policy, "policy")
 
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
         pass
 
     @property

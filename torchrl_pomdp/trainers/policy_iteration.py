@@ -109,10 +109,7 @@ class PolicyIteration:
             base: the current policy.
             iteration: number of the iteration; random numbers depend on it and on the seed.
         """
-        if isinstance(base, PartitionedPolicy):
-            local = list(base.policies)
-        else:
-            local = [base] * self.partition.num_parts
+        local = list(base.policies) if isinstance(base, PartitionedPolicy) else [base] * self.partition.num_parts
         networks = self._initial_networks(base, iteration)
         for stage in self.partition.stages:
             self._train_stage(networks, PartitionedPolicy(local), stage, iteration)
@@ -159,9 +156,7 @@ class PolicyIteration:
         finally:
             trainer.collector.shutdown()
 
-    def _collector(
-        self, base: PartitionedPolicy, stage: tuple[int, ...], iteration: int, frames: int
-    ) -> RolloutImprovement:
+    def _collector(self, base: PartitionedPolicy, stage: tuple[int, ...], iteration: int, frames: int) -> RolloutImprovement:
         config, problem = self.config, self.problem
         number = self.partition.stages.index(stage)
         label = partial(
@@ -186,7 +181,7 @@ class PolicyIteration:
         """Random states of a part mixed with states of the part that ``base`` visits."""
         config, problem = self.config, self.problem
         visited = VisitedStates(problem.model, problem.start, base, part=part, exploration=config.exploration)
-        generators = [problem.training[part], InPart(problem.model, visited, part)]
+        generators: list[StateGenerator] = [problem.training[part], InPart(problem.model, visited, part)]
         return Mixture(generators, [1.0 - config.visited_share, config.visited_share])
 
     def _buffers(self, stage: tuple[int, ...], seed: int) -> ReplayBufferEnsemble:
@@ -214,9 +209,7 @@ class PolicyIteration:
 class _Stepper(DefaultOptimizationStepper):
     """TorchRL's optimisation step with a falling step size, a log of the losses and a progress bar."""
 
-    def __init__(
-        self, optimizer: torch.optim.Optimizer, steps: int, name: str, logger: Logger | None, progress: bool
-    ) -> None:
+    def __init__(self, optimizer: torch.optim.Optimizer, steps: int, name: str, logger: Logger | None, progress: bool) -> None:
         super().__init__()
         self.schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=steps)
         self.name, self.logger = name, logger
@@ -247,7 +240,5 @@ def _sample(buffers: ReplayBufferEnsemble, batch: TensorDictBase) -> TensorDictB
 
 def _partition(problem: Problem) -> Partition:
     if problem.model.partition is None:
-        raise ValueError(
-            f"the model of problem {problem.name!r} has no partition; give it one, SinglePart() for plain policy iteration"
-        )
+        raise ValueError(f"the model of problem {problem.name!r} has no partition; give it one, SinglePart() for none")
     return problem.model.partition
