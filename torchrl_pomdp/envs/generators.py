@@ -138,6 +138,7 @@ class InPart:
         proposal: generator of candidate states.
         part: the part that states must lie in.
         max_tries: candidates for one state before giving up.
+        fallback: generator of states of the part for keys without an acceptable candidate; None raises.
 
     Raises:
         ValueError: if ``part`` is not a part of the model's partition; when called, if a state has no acceptable
@@ -151,12 +152,19 @@ class InPart:
         [2]
     """
 
-    def __init__(self, model: BeliefModel, proposal: StateGenerator, part: int, max_tries: int = 500) -> None:
+    def __init__(
+        self,
+        model: BeliefModel,
+        proposal: StateGenerator,
+        part: int,
+        max_tries: int = 500,
+        fallback: StateGenerator | None = None,
+    ) -> None:
         if model.partition is None or not 0 <= part < model.partition.num_parts:
             parts = 0 if model.partition is None else model.partition.num_parts
             raise ValueError(f"part must be one of the model's {parts} parts, got {part}")
         self.model, self.proposal, self.part, self.max_tries = model, proposal, part, max_tries
-        self.partition = model.partition
+        self.partition, self.fallback = model.partition, fallback
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` of the part for int64 keys ``[*B]``; terminal states are rejected too."""
@@ -175,6 +183,9 @@ class InPart:
             chosen = torch.arange(missing.numel(), device=keys.device) * width + first
             result[missing[found]] = candidates[chosen[found]]
             missing = missing[~found]
+        if missing.numel() and self.fallback is not None:
+            result[missing] = self.fallback(flat[missing])
+            missing = missing[:0]
         if missing.numel() == 0:
             return result.view(keys.shape)
         raise ValueError(

@@ -181,7 +181,11 @@ class PolicyIteration:
         """Random states of a part mixed with states of the part that ``base`` visits."""
         config, problem = self.config, self.problem
         visited = VisitedStates(problem.model, problem.start, base, part=part, exploration=config.exploration)
-        generators: list[StateGenerator] = [problem.training[part], InPart(problem.model, visited, part)]
+        generators: list[StateGenerator] = [
+            problem.training[part],
+            # A part that the policy hardly visits is filled with random states.
+            InPart(problem.model, visited, part, max_tries=100, fallback=problem.training[part]),
+        ]
         return Mixture(generators, [1.0 - config.visited_share, config.visited_share])
 
     def _buffers(self, stage: tuple[int, ...], seed: int) -> ReplayBufferEnsemble:
