@@ -83,6 +83,8 @@ class RolloutImprovement(Collector):
         # The data is no environment rollout: buffers of that layout and transforms for it do not apply.
         kwargs["use_buffers"] = False
         kwargs["auto_register_policy_transforms"] = False
+        # Any callable on feature states is a policy; TorchRL would map its arguments to entries.
+        kwargs["trust_policy"] = True
         super().__init__(
             create_env_fn,
             copy.deepcopy(policy),
