@@ -150,10 +150,9 @@ class VisitedStates:
 
     def _pick(self, picked: TensorDictBase, seen: Tensor, y: TensorDictBase, live: Tensor, keys: Tensor, step: int) -> None:
         """Reservoir sampling: the n-th eligible state of a trajectory replaces the picked one with probability 1/n."""
-        eligible = live if self.part is None else live[y.get("partition") == self.part]
-        seen[eligible] += 1
-        chance = uniform(fold(keys[live], _PICK), step) * seen[live] < 1.0
-        replace = chance if self.part is None else chance & (y.get("partition") == self.part)
+        eligible = torch.ones_like(live, dtype=torch.bool) if self.part is None else y.get("partition") == self.part
+        seen[live[eligible]] += 1
+        replace = eligible & (uniform(fold(keys[live], _PICK), step) * seen[live] < 1.0)
         picked[live[replace]] = y.select(*self.model.state_keys)[replace]
 
     def _control(self, y: TensorDictBase, keys: Tensor, step: int) -> Tensor:
