@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_pomdp.envs.graphs import Graph
+from torchrl_pomdp.envs.sums import sum_first
 
 __all__ = ["Partition", "RepairPartition", "SinglePart"]
 
@@ -113,12 +114,19 @@ class RepairPartition(Partition):
 
     def _density(self, levels: Tensor, location: Tensor) -> Tensor:
         """0 where the damage is mostly left, 1 where balanced, 2 where mostly right: int64 ``[*B]``."""
-        cost = (levels.flatten(1).T @ self.costs).reshape(levels.shape[1:])
+        cost = location_costs(levels, self.costs)
         column = self.columns.view(-1, *([1] * (cost.ndim - 1)))
         centre = self.columns[location].mean(-1)
-        left = (cost * (column < centre)).sum(0)
-        right = (cost * (column > centre)).sum(0)
+        left, right = sum_first(cost * (column < centre)), sum_first(cost * (column > centre))
         low, high = self.density_bounds
         total = left + right
         # Cross-multiplied, so that no damage on either side (total = 0) is balanced.
         return 1 - (left > high * total).to(torch.int64) + (left < low * total).to(torch.int64)
+
+
+def location_costs(planes: Tensor, costs: Tensor) -> Tensor:
+    """Expected cost of every location, ``[L, *B]``, for beliefs as planes ``[K, L, *B]`` and costs ``[K]``."""
+    total = planes[0] * costs[0]
+    for level in range(1, len(costs)):
+        total.add_(planes[level] * costs[level])
+    return total

@@ -21,7 +21,8 @@ from torchrl.data import Bounded, Categorical, Composite
 
 from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf
 from torchrl_pomdp.envs.graphs import Graph
-from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.envs.partition import Partition, location_costs
+from torchrl_pomdp.envs.sums import sum_first
 
 __all__ = ["REPAIR", "RepairModel", "damage_chain"]
 
@@ -89,7 +90,6 @@ class RepairModel(BeliefModel):
     destinations: Tensor
     first_controls: Tensor
     _levels: Tensor
-    _cost_row: Tensor
 
     def __init__(
         self,
@@ -131,8 +131,6 @@ class RepairModel(BeliefModel):
             # [L, A]: location after a robot's control, -1 where the move leaves the graph.
             "destinations": destinations,
             "first_controls": self.graph.first_controls,
-            # [1, K L]: stage cost of flattened planes.
-            "_cost_row": costs.repeat_interleave(self.num_locations).unsqueeze(0),
             "_levels": torch.arange(self.num_levels).unsqueeze(-1),
         }
         for name, value in tables.items():
@@ -273,8 +271,7 @@ class RepairModel(BeliefModel):
         return belief.permute(2, 1, 0).contiguous()
 
     def _stage_cost(self, planes: Tensor) -> Tensor:
-        # A matrix product sums a column in the same order in any batch, which a reduction over planes does not.
-        return (self._cost_row @ planes.flatten(0, 1)).squeeze(0)
+        return sum_first(location_costs(planes, self.costs))
 
     def _transition(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Degraded planes, and for each robot ``[R, N]`` its new location and whether it repairs there."""
