@@ -26,8 +26,9 @@ class RolloutImprovement(Collector):
     r"""Collector whose frames are feature states labelled with the rollout control of a base policy.
 
     Every batch is a flat TensorDict ``[frames_per_batch]`` with the feature state (core entries, ``action_mask``,
-    ``partition``), ``action`` (the rollout control), ``q_factors`` ``[., U]`` (costs) and ``("collector", "mask")``. It has
-    no ``"next"``: a label is no transition. It runs alone and, as ``collector_class``, under ``MultiSyncCollector``.
+    ``partition``), ``action`` (the rollout control), ``q_factors`` ``[., U]`` (costs), ``("collector", "mask")`` and the
+    state's number in ``("collector", "traj_ids")``. It has no ``"next"``: a label is no transition. It runs alone and, as
+    ``collector_class``, under ``MultiSyncCollector``.
 
     State number i of the run is ``states(i)`` whichever worker labels it, and a label is a function of the state and the
     seed alone: any number of workers yields the same data.
@@ -113,7 +114,8 @@ class RolloutImprovement(Collector):
                     blocks.append(self.labeller(y))
                     bar.update(y.batch_size.numel())
         batch: Any = torch.cat(blocks, 0)
-        return batch.set(("collector", "mask"), torch.ones(size, dtype=torch.bool, device=batch.device))
+        batch.set(("collector", "traj_ids"), index)
+        return batch.set(("collector", "mask"), torch.ones_like(index, dtype=torch.bool))
 
     def state_dict(self) -> dict[str, Any]:
         """State of the base policy and the number of batches made."""
