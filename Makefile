@@ -1,12 +1,12 @@
 .DELETE_ON_ERROR:
-.PHONY: demo test lint
+.PHONY: demo test lint tutorials
 
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO ?= runs/demo-$(shell date +%Y%m%d-%H%M%S)
 
 demo: .venv/installed
-	$(BIN)/torchrl-pomdp train linear20 --samples-per-part 7000 --trajectories 6 --iterations 2 --out $(DEMO)
+	$(BIN)/torchrl-pomdp train linear20 --samples-per-part 9000 --trajectories 6 --iterations 2 --out $(DEMO)
 
 test: .venv/installed lint
 	$(BIN)/pytest
@@ -15,6 +15,11 @@ lint: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Make the notebooks anew from their scripts, with their outputs.
+tutorials: .venv/installed
+	$(BIN)/jupytext --to ipynb tutorials/*.py
+	$(BIN)/jupyter-execute --inplace tutorials/*.ipynb
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -100,18 +100,19 @@ def trajectory_figure(model: RepairModel, trajectory: TensorDictBase, title: str
     figure = _new_figure(max(5.0, 0.14 * steps + 2.5), max(2.5, 0.16 * model.num_locations + 1.2))
     axes = figure.add_subplot()
     image = axes.imshow(
-        damage.T.cpu(), aspect="auto", cmap="YlOrRd", vmin=0, vmax=model.num_levels - 1, interpolation="nearest"
+        damage.T.cpu().numpy(), aspect="auto", cmap="YlOrRd", vmin=0, vmax=model.num_levels - 1, interpolation="nearest"
     )
     figure.colorbar(image, ax=axes, label="expected damage level")
     controls = model.split_controls(trajectory["action"])
     for robot in range(model.num_robots):
-        path = trajectory["location"][:, robot].cpu()
+        path = trajectory["location"][:, robot].cpu().numpy()
         axes.plot(range(steps), path, color="#1f4e79", linewidth=1.2, label=f"robot {robot + 1}")
-        repairs = (controls[:, robot] == REPAIR).nonzero().squeeze(-1).cpu()
-        axes.scatter(repairs, path[repairs], marker="P", s=26, color="#1f4e79", edgecolor="white", linewidth=0.4)
+        repairs = (controls[:, robot] == REPAIR).nonzero().squeeze(-1).cpu().numpy()
+        axes.scatter(repairs, path[repairs], marker="P", s=44, color="#1f4e79", edgecolor="white", linewidth=0.6)
     axes.scatter([], [], marker="P", color="#1f4e79", label="repair")
     axes.legend(loc="upper right", fontsize="small")
     axes.set(xlabel="stage", ylabel="location", title=title)
+    axes.locator_params(integer=True)
     return figure
 
 

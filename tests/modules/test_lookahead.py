@@ -18,7 +18,6 @@ from torchrl_pomdp.modules import (
     TruncatedRollout,
 )
 
-
 # Optimal value of Tiger from the uniform belief at discount 0.95, as a cost.
 TIGER_OPTIMUM = -19.371368
 
@@ -71,8 +70,8 @@ def test_q_factors_are_infinite_exactly_where_illegal(linear20):
 
 def test_labels_do_not_depend_on_batch_order_or_chunks(linear20):
     model = linear20.model
-    y = linear20.start(torch.arange(60))
-    order = torch.randperm(60, generator=torch.Generator().manual_seed(0))
+    y = linear20.start(torch.arange(24))
+    order = torch.randperm(24, generator=torch.Generator().manual_seed(0))
     network = PolicyNetwork(RelativeEncoder(model), 3, generator=torch.Generator().manual_seed(0))
     for base in (GreedyRepair(model), network):
         for leaves in ("control", "observation"):
@@ -86,7 +85,16 @@ def test_labels_do_not_depend_on_batch_order_or_chunks(linear20):
             assert torch.equal(q(y, chunk_rows=100), reference)
             assert torch.equal(q(y[order]), reference[order])
             assert torch.equal(q(y[7:8]), reference[7:8])
-            assert torch.equal(q(y.reshape(3, 20)), reference.view(3, 20, 3))
+            assert torch.equal(q(y.reshape(3, 8)), reference.view(3, 8, 3))
+            assert q(y[:0]).shape == (0, 3)
+
+
+def test_labels_of_a_tabular_model_do_not_depend_on_the_batch():
+    belief = torch.rand(40, 1, generator=torch.Generator().manual_seed(0))
+    y = TensorDict({"belief": torch.cat([belief, 1 - belief], -1)}, [40])
+    policy = RolloutPolicy(tiger(), ListenThenOpen(0.9), trajectories=3, max_steps=60)
+    reference = policy.q_factors(y)
+    assert torch.equal(torch.cat([policy.q_factors(part) for part in y.split(7)]), reference)
 
 
 def test_seeds_change_the_noise_and_nothing_else_does(linear20):

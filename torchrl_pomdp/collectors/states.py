@@ -9,10 +9,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf, take_rows
+from torchrl_pomdp.envs.generators import InPart
+from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.modules.rollout import Policy, step_noise
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 
-__all__ = ["Mixture", "PartSampler", "StateSampler", "VisitedStates"]
+__all__ = ["Mixture", "PartSampler", "StateSampler", "VisitedStates", "training_states"]
 
 StateSampler = Callable[[Tensor], TensorDictBase]
 """Numbered training states: maps int64 numbers ``[N]`` to feature states ``[N]``, the same number to the same state."""
@@ -48,8 +50,7 @@ class PartSampler:
         """Feature states ``[N]`` with the numbers ``index``, int64 ``[N]``."""
         keys = seed_keys(self.seed, index)
         which = index % len(self.generators)
-        drawn = [generator(keys[which == i]) for i, generator in enumerate(self.generators.values())]
-        return torch.cat(drawn, 0)[which.argsort(stable=True).argsort()]
+        return _draw_each(list(self.generators.values()), which, keys)
 
 
 class Mixture:
@@ -79,8 +80,7 @@ class Mixture:
         flat = keys.reshape(-1)
         probs = self.weights.to(keys.device).expand(flat.numel(), -1)
         which = inverse_cdf(probs, uniform(fold(flat, _CHOICE), 0))
-        drawn = [generator(flat[which == i]) for i, generator in enumerate(self.generators) if bool((which == i).any())]
-        return torch.cat(drawn, 0)[which.argsort(stable=True).argsort()].view(keys.shape)
+        return _draw_each(self.generators, which, flat).view(keys.shape)
 
 
 class VisitedStates:
@@ -161,3 +161,41 @@ class VisitedStates:
         u = self.policy(y.copy()).get("action")
         random = inverse_cdf(mask, uniform(fold(keys, _CONTROL), step))
         return torch.where(uniform(fold(keys, _EXPLORE), step) < self.exploration, random, u)
+
+
+def training_states(
+    problem: Problem, policy: Policy, part: int, *, visited_share: float = 0.5, exploration: float = 0.15
+) -> StateGenerator:
+    """Random states of a part, mixed with states of the part that a policy visits from the problem's start states.
+
+    Args:
+        problem: the problem; its training generators give the random states.
+        policy: the policy that is followed.
+        part: the part.
+
+    Keyword Args:
+        visited_share: share of visited states, in [0, 1]. A trajectory that never enters the part is replaced by another;
+            where a hundred do not, a random state takes the place.
+        exploration: probability of a random legal control at each step of the visits, in [0, 1].
+
+    Raises:
+        ValueError: if a probability is out of range or there is no such part.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> problem = make_problem("linear20")
+        >>> y = training_states(problem, GreedyRepair(problem.model), part=4)(torch.arange(8))
+        >>> problem.model.partition(y).unique().tolist()
+        [4]
+    """
+    random = problem.training[part]
+    visited = VisitedStates(problem.model, problem.start, policy, part=part, exploration=exploration)
+    in_part = InPart(problem.model, visited, part, max_tries=100, fallback=random)
+    return Mixture([random, in_part], [1.0 - visited_share, visited_share])
+
+
+def _draw_each(generators: Sequence[StateGenerator], which: Tensor, keys: Tensor) -> TensorDictBase:
+    """States ``[N]`` for keys ``[N]``, the i-th from the generator number ``which[i]``."""
+    drawn = [generator(keys[which == i]) for i, generator in enumerate(generators) if bool((which == i).any())]
+    return torch.cat(drawn, 0)[which.argsort(stable=True).argsort()]

@@ -106,6 +106,11 @@ class BeliefModel(nn.Module, ABC):
     def device(self) -> torch.device:
         """Device of the model's tensors."""
 
+    @property
+    @abstractmethod
+    def dtype(self) -> torch.dtype:
+        """Type of beliefs and costs, float32 or float64."""
+
     @abstractmethod
     def state_spec(self, batch_size: torch.Size | tuple[int, ...] = ()) -> Composite:
         """Specs of the core entries: leaf shape is ``batch_size`` followed by the entry's own shape."""

@@ -75,6 +75,11 @@ class TabularModel(BeliefModel):
         """Device of the model's tensors."""
         return self.transition.device
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """Type of beliefs and costs."""
+        return self.transition.dtype
+
     def state_spec(self, batch_size: torch.Size | tuple[int, ...] = ()) -> Composite:
         """``belief`` ``[*B, n]`` in [0, 1]."""
         shape = torch.Size(batch_size)

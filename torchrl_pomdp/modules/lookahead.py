@@ -99,7 +99,11 @@ class RolloutPolicy(TensorDictModuleBase):
         branches = self.model.num_controls * (self.model.num_observations if self.leaves == "observation" else 1)
         size = max(1, self.chunk_rows // (self.trajectories * branches))
         parts = [self._q_factors(flat[start : start + size]) for start in range(0, flat.shape[0], size)]
-        q = torch.cat(parts) if parts else torch.zeros(0, self.model.num_controls, device=self.model.device)
+        q = (
+            torch.cat(parts)
+            if parts
+            else torch.zeros(0, self.model.num_controls, dtype=self.model.dtype, device=self.model.device)
+        )
         return q.view(*y.batch_size, self.model.num_controls)
 
     def _q_factors(self, y: TensorDictBase) -> Tensor:

@@ -84,7 +84,7 @@ class TruncatedRollout(nn.Module):
         Returns:
             costs ``[N]``.
         """
-        total = torch.zeros(keys.shape, dtype=self.model.expected_cost(y[:1], keys[:1] * 0).dtype, device=keys.device)
+        total = torch.zeros(keys.shape, dtype=self.model.dtype, device=keys.device)
         live = torch.arange(keys.numel(), device=keys.device)
         y = self.model.with_features(y, self._keys)
         discount = 1.0

@@ -19,9 +19,8 @@ from torchrl.record.loggers import Logger
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 from tqdm import tqdm
 
-from torchrl_pomdp.collectors import Mixture, PartSampler, RolloutImprovement, VisitedStates
-from torchrl_pomdp.envs.belief import BeliefEnv, StateGenerator
-from torchrl_pomdp.envs.generators import InPart
+from torchrl_pomdp.collectors import PartSampler, RolloutImprovement, training_states
+from torchrl_pomdp.envs.belief import BeliefEnv
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.modules import FlatEncoder, PartitionedPolicy, PolicyNetwork, RelativeEncoder, RolloutPolicy
@@ -137,7 +136,7 @@ class PolicyIteration:
         loss = ClassificationLoss(networks, config.loss)
         steps = max(1, config.epochs * config.samples_per_part // config.batch_size)
         optimizer = torch.optim.RMSprop(loss.parameters(), config.learning_rate)
-        name = f"iteration {iteration + 1}, stage {number + 1}"
+        name = f"iteration-{iteration + 1}-stage-{number + 1}"
         trainer = Trainer(
             collector=self._collector(base, stage, iteration, frames),
             total_frames=frames,
@@ -166,7 +165,8 @@ class PolicyIteration:
             max_steps=config.max_steps,
             seed=self._seed(iteration, "labels", number),
         )
-        generators = {part: self._training_states(base, part) for part in stage}
+        share = {"visited_share": config.visited_share, "exploration": config.exploration}
+        generators = {part: training_states(problem, base, part, **share) for part in stage}
         return RolloutImprovement(
             BeliefEnv(problem.model, problem.start),
             base,
@@ -176,17 +176,6 @@ class PolicyIteration:
             label=label,
             progress=self.progress,
         )
-
-    def _training_states(self, base: PartitionedPolicy, part: int) -> StateGenerator:
-        """Random states of a part mixed with states of the part that ``base`` visits."""
-        config, problem = self.config, self.problem
-        visited = VisitedStates(problem.model, problem.start, base, part=part, exploration=config.exploration)
-        generators: list[StateGenerator] = [
-            problem.training[part],
-            # A part that the policy hardly visits is filled with random states.
-            InPart(problem.model, visited, part, max_tries=100, fallback=problem.training[part]),
-        ]
-        return Mixture(generators, [1.0 - config.visited_share, config.visited_share])
 
     def _buffers(self, stage: tuple[int, ...], seed: int) -> ReplayBufferEnsemble:
         """One buffer for each part, written by ``"partition"``; batches come from the parts of the stage alone."""
@@ -226,7 +215,7 @@ class _Stepper(DefaultOptimizationStepper):
         self.count += 1
         if self.logger is not None and self.count % _LOG_INTERVAL == 0:
             for key in ("loss_policy", "accuracy", "regret"):
-                self.logger.log_scalar(f"{self.name}/{key}".replace(" ", "_"), losses[key].item(), step=self.count)
+                self.logger.log_scalar(f"{self.name}/{key}", losses[key].item(), step=self.count)
         self.bar.update()
         if self.count == self.bar.total:
             self.bar.close()

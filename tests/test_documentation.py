@@ -1,0 +1,61 @@
+"""Every block of the README and every tutorial runs; the notebooks are those of their scripts."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import jupytext
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+ROOT = Path(__file__).parents[1]
+SCRIPTS = sorted((ROOT / "tutorials").glob("*.py"))
+# Parameters of every tutorial at a size for tests.
+SMALL = {
+    "01_policy_iteration": {
+        "ITERATIONS": 1, "SAMPLES_PER_PART": 40, "TRAJECTORIES": 2, "OPTIMIZATION_STEPS": 5, "EVALUATION_STATES": 20,
+    },
+}  # fmt: skip
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+
+
+def test_readme_blocks_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert blocks("python")
+    for block in blocks("python"):
+        exec(compile(block, "README.md", "exec"), {"__name__": "readme"})
+    assert capsys.readouterr().out
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_notebooks_are_their_scripts(script):
+    notebook = nbformat.read(script.with_suffix(".ipynb"), as_version=4)
+    expected = jupytext.read(script)
+    cells = [[(cell.cell_type, cell.source) for cell in each.cells] for each in (notebook, expected)]
+    assert cells[0] == cells[1], f"run `make tutorials`: {script.stem}.ipynb is not made from its script"
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_tutorials_run_at_a_small_size(script):
+    notebook = jupytext.read(script)
+    (parameters,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
+    for name, value in SMALL[script.stem].items():
+        parameters.source, count = re.subn(rf"^{name} = .*$", f"{name} = {value}", parameters.source, flags=re.MULTILINE)
+        assert count == 1, name
+    NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    text = "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
+    assert "| greedy |" in text
+
+
+def test_the_loop_of_tutorial_1_is_short_and_uses_no_trainer():
+    source = (ROOT / "tutorials" / "01_policy_iteration.py").read_text()
+    loop = source[source.index("def improve(") : source.index("# ## Does it work?")]
+    assert len([line for line in loop.splitlines() if line.strip() and not line.startswith("#")]) < 40
+    assert "trainers" not in source
