@@ -195,18 +195,19 @@ class BeliefModel(nn.Module, ABC):
         """
         if not isinstance(y, TensorDictBase):
             raise TypeError(f"y must be a TensorDict, got {type(y).__name__}")
-        for key, leaf in self.state_spec(y.batch_size).items():
+        for key, leaf in self.state_spec().items():
             value = y.get(key, None)
             if value is None:
                 raise ValueError(f"y lacks the entry {key!r}; a feature state needs {list(self.state_keys)}")
-            if value.shape != leaf.shape:
+            shape = (*y.batch_size, *leaf.shape)
+            if value.shape != shape:
                 raise ValueError(
-                    f"entry {key!r} of y has shape {tuple(value.shape)}, expected {tuple(leaf.shape)}: "
+                    f"entry {key!r} of y has shape {tuple(value.shape)}, expected {shape}: "
                     f"the batch {tuple(y.batch_size)} followed by the entry's own shape"
                 )
             if value.dtype != leaf.dtype:
                 raise TypeError(f"entry {key!r} of y has dtype {value.dtype}, expected {leaf.dtype}")
-            if not leaf.is_in(value):
+            if value.numel() and not leaf.expand(shape).is_in(value):
                 raise ValueError(f"entry {key!r} of y holds values outside its bounds: expected {leaf}")
 
     def describe(self) -> str:

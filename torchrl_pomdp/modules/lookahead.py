@@ -95,6 +95,9 @@ class RolloutPolicy(TensorDictModuleBase):
     def q_factors(self, y: TensorDictBase) -> Tensor:
         r""":math:`\tilde Q(y,u)` ``[*B, U]``, ``+inf`` where the control is illegal."""
         self.model.check_state(y)
+        shape = (*y.batch_size, self.model.num_controls)
+        if y.batch_size.numel() == 0:
+            return torch.zeros(shape, dtype=self.model.dtype, device=self.model.device)
         flat = self.model.with_features(y, ("action_mask",)).reshape(-1)
         branches = self.model.num_controls * (self.model.num_observations if self.leaves == "observation" else 1)
         size = max(1, self.chunk_rows // (self.trajectories * branches))
