@@ -7,6 +7,7 @@ routed by it, and training proceeds in stages of parts.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -90,7 +91,6 @@ class RepairPartition(Partition):
     )
     stages = ((3, 4, 5), (0, 1, 2))
     density_bounds = (0.3, 0.7)
-    costs: Tensor
     columns: Tensor
 
     def __init__(
@@ -100,21 +100,21 @@ class RepairPartition(Partition):
         if not 0.0 <= damage_threshold < 1.0:
             raise ValueError(f"damage_threshold must be in [0, 1), got {damage_threshold}")
         self.damage_threshold = damage_threshold
-        self.register_buffer("costs", costs.to(device), persistent=False)
+        self._prices = tuple(costs.tolist())
         self.register_buffer("columns", graph.columns.to(device), persistent=False)
 
     def forward(self, y: TensorDictBase) -> Tensor:
         """Part index int64 ``[*B]``: three times the phase (0 startgame, 1 endgame) plus the density class."""
         belief, location = y.get("belief"), y.get("location")
-        # [L, *B] and [K, L, *B] views: the model keeps the batch innermost.
-        levels = belief.movedim((-1, -2), (0, 1))
-        num_damaged = (levels[0] < 1.0 - self.damage_threshold).sum(0)
+        # A view [L, K, *B]: the model keeps the batch innermost.
+        planes = belief.movedim((-2, -1), (0, 1))
+        num_damaged = (planes[:, 0] < 1.0 - self.damage_threshold).sum(0)
         endgame = 2 * num_damaged < belief.shape[-2]
-        return 3 * endgame.to(torch.int64) + self._density(levels, location)
+        return 3 * endgame.to(torch.int64) + self._density(planes, location)
 
-    def _density(self, levels: Tensor, location: Tensor) -> Tensor:
+    def _density(self, planes: Tensor, location: Tensor) -> Tensor:
         """0 where the damage is mostly left, 1 where balanced, 2 where mostly right: int64 ``[*B]``."""
-        cost = location_costs(levels, self.costs)
+        cost = location_costs(planes, self._prices)
         column = self.columns.view(-1, *([1] * (cost.ndim - 1)))
         centre = self.columns[location].mean(-1)
         left, right = sum_first(cost * (column < centre)), sum_first(cost * (column > centre))
@@ -124,9 +124,9 @@ class RepairPartition(Partition):
         return 1 - (left > high * total).to(torch.int64) + (left < low * total).to(torch.int64)
 
 
-def location_costs(planes: Tensor, costs: Tensor) -> Tensor:
-    """Expected cost of every location, ``[L, *B]``, for beliefs as planes ``[K, L, *B]`` and costs ``[K]``."""
-    total = planes[0] * costs[0]
+def location_costs(planes: Tensor, costs: Sequence[float]) -> Tensor:
+    """Expected cost of every location, ``[L, *B]``, for beliefs as planes ``[L, K, *B]`` and a cost for each level."""
+    total = planes[:, 0] * costs[0]
     for level in range(1, len(costs)):
-        total.add_(planes[level] * costs[level])
+        total.add_(planes[:, level], alpha=costs[level])
     return total

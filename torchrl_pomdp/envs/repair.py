@@ -5,7 +5,7 @@ location or moves to a neighbour; (3) every location that is not just repaired t
 (4) every robot observes exactly the level of the location where it now stands.
 
 Locations stay independent given the history, so the belief is a product of marginals, ``belief[..., l, k]`` = P(level of
-location l is k), updated in closed form. Inside, beliefs are planes ``[K, L, N]`` with the batch innermost: a step is a few
+location l is k), updated in closed form. Inside, beliefs are planes ``[L, K, N]`` with the batch innermost: a step is a few
 elementwise passes over contiguous memory. What callers see is a ``[*B, L, K]`` view of these planes.
 """
 
@@ -135,7 +135,8 @@ class RepairModel(BeliefModel):
         }
         for name, value in tables.items():
             self.register_buffer(name, value.to(device), persistent=False)
-        self._stay = self.chain.diagonal().view(-1, 1, 1)
+        self._prices = tuple(costs.tolist())
+        self._stay = self.chain.diagonal().view(-1, 1)
         self._diagonals = list(_off_diagonals(self.chain))
 
     # ---- specs and descriptions ----------------------------------------------------------------------------------
@@ -210,7 +211,7 @@ class RepairModel(BeliefModel):
         """Bool ``[*B]``: P(any damage) <= ``terminal_probability``; never where level 0 is not absorbing."""
         if not self.level_zero_absorbing:
             return torch.zeros(y.batch_size, dtype=torch.bool, device=self.device)
-        intact = self._planes(y)[0].prod(0)
+        intact = self._planes(y)[:, 0].prod(0)
         return (1.0 - intact <= self.terminal_probability).view(y.batch_size)
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
@@ -263,15 +264,15 @@ class RepairModel(BeliefModel):
         """Marginals ``[..., K]`` after ``steps`` steps of the chain without repairs or observations."""
         return belief @ torch.linalg.matrix_power(self.chain, steps)
 
-    # ---- kernels on planes [K, L, N] and locations [R, N] ----------------------------------------------------------
+    # ---- kernels on planes [L, K, N] and locations [R, N] ----------------------------------------------------------
 
     def _planes(self, y: TensorDictBase) -> Tensor:
-        """Belief of ``y`` as contiguous planes ``[K, L, N]``; free for states that the model made."""
+        """Belief of ``y`` as contiguous planes ``[L, K, N]``; free for states that the model made."""
         belief = y.get("belief").reshape(-1, self.num_locations, self.num_levels)
-        return belief.permute(2, 1, 0).contiguous()
+        return belief.permute(1, 2, 0).contiguous()
 
     def _stage_cost(self, planes: Tensor) -> Tensor:
-        return sum_first(location_costs(planes, self.costs))
+        return sum_first(location_costs(planes, self._prices))
 
     def _transition(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Degraded planes, and for each robot ``[R, N]`` its new location and whether it repairs there."""
@@ -284,7 +285,7 @@ class RepairModel(BeliefModel):
         """One step of the chain in every location: a pass over the planes for each nonzero diagonal."""
         result = planes * self._stay
         for source, target, probs in self._diagonals:
-            result[target].addcmul_(planes[source], probs)
+            result[:, target].addcmul_(planes[:, source], probs)
         return result
 
     def _observe(self, planes: Tensor, location: Tensor, noise: Tensor, repaired: Tensor) -> None:
@@ -300,18 +301,14 @@ class RepairModel(BeliefModel):
 
     def _levels_at(self, planes: Tensor, location: Tensor) -> Tensor:
         """Marginal ``[K, N]`` of each row's ``location`` ``[N]``."""
-        return planes.flatten(1).index_select(1, self._flat_index(planes, location))
+        return planes.gather(0, location.expand(1, *planes.shape[1:])).squeeze(0)
 
     def _put(self, planes: Tensor, location: Tensor, levels: Tensor) -> None:
-        planes.view(self.num_levels, -1).index_copy_(1, self._flat_index(planes, location), levels)
-
-    def _flat_index(self, planes: Tensor, location: Tensor) -> Tensor:
-        size = planes.shape[-1]
-        return location * size + torch.arange(size, device=planes.device)
+        planes.scatter_(0, location.expand(1, *planes.shape[1:]), levels.unsqueeze(0))
 
     def _successor(self, y: TensorDictBase, planes: Tensor, location: Tensor) -> TensorDictBase:
         shape = y.batch_size
-        belief = planes.permute(2, 1, 0).reshape(*shape, self.num_locations, self.num_levels)
+        belief = planes.permute(2, 0, 1).reshape(*shape, self.num_locations, self.num_levels)
         return self.successor(y, belief=belief, location=location.T.reshape(*shape, self.num_robots))
 
 
@@ -324,14 +321,14 @@ def _digits(number: Tensor, base: int, count: int) -> Tensor:
 
 
 def _off_diagonals(chain: Tensor) -> Iterator[tuple[slice, slice, Tensor]]:
-    """Source levels, target levels and probabilities ``[., 1, 1]`` of the chain's nonzero off-diagonals."""
+    """Source levels, target levels and probabilities ``[., 1]`` of the chain's nonzero off-diagonals."""
     size = chain.shape[0]
     for offset in range(1 - size, size):
         probs = chain.diagonal(offset)
         if offset != 0 and bool((probs != 0).any()):
             low, high = slice(0, size - abs(offset)), slice(abs(offset), size)
             source, target = (low, high) if offset > 0 else (high, low)
-            yield source, target, probs.view(-1, 1, 1)
+            yield source, target, probs.view(-1, 1)
 
 
 def _scientific(number: int) -> tuple[float, int]:
