@@ -7,7 +7,7 @@ TorchRL call :class:`BeliefEnv`, a thin skin over it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.noise import fingerprint
 
-__all__ = ["BeliefEnv", "BeliefModel", "StateGenerator", "inverse_cdf", "take_rows"]
+__all__ = ["BeliefEnv", "BeliefModel", "StateGenerator", "inverse_cdf", "join_rows", "take_rows"]
 
 StateGenerator = Callable[[Tensor], TensorDictBase]
 """Distribution of feature states: maps int64 keys ``[*B]`` to feature states ``[*B]``, the same key to the same state."""
@@ -64,6 +64,24 @@ def take_rows(y: TensorDictBase, index: Tensor) -> TensorDictBase:
         return leaf.index_select(0, index)
 
     return TensorDict({key: take(leaf) for key, leaf in y.items()}, batch_size=index.shape, device=y.device)
+
+
+def join_rows(batches: Sequence[TensorDictBase]) -> TensorDictBase:
+    """The rows of several flat batches, one batch after the other, each entry in the memory layout that it has first.
+
+    Examples:
+        >>> y = TensorDict({"belief": torch.rand(3, 5).T}, [5])
+        >>> join_rows([y, y[:2]])["belief"].stride()
+        (1, 7)
+    """
+
+    def join(leaves: list[Tensor]) -> Tensor:
+        if leaves[0].ndim > 1 and leaves[0].stride(0) == 1:
+            return torch.cat([leaf.movedim(0, -1) for leaf in leaves], -1).movedim(-1, 0)
+        return torch.cat(leaves)
+
+    joined = {key: join([batch.get(key) for batch in batches]) for key in batches[0].keys()}
+    return TensorDict(joined, batch_size=[sum(batch.batch_size[0] for batch in batches)], device=batches[0].device)
 
 
 class BeliefModel(nn.Module, ABC):

@@ -3,12 +3,13 @@ r"""The rollout engine: Monte-Carlo estimates of :math:`(T_\mu^m\hat J)(y)` (pap
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_pomdp.envs.belief import BeliefModel, take_rows
+from torchrl_pomdp.envs.belief import BeliefModel, join_rows, take_rows
 from torchrl_pomdp.noise import uniform
 
 __all__ = ["Policy", "TerminalCost", "TruncatedRollout", "step_noise"]
@@ -19,14 +20,30 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 TerminalCost = Callable[[TensorDictBase], Tensor]
 """Terminal cost approximation: feature states ``[*B]`` to costs ``[*B]``."""
 
-# Finished rows are dropped when they are more than this fraction of the batch; dropping more often costs more copies.
-_DROP_FRACTION = 0.2
+# Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
+_RENEW_FRACTION = 0.15
 
 
-def step_noise(keys: Tensor, step: int, noise_dim: int) -> Tensor:
-    """Uniforms ``[*B, noise_dim]`` of one step of the trajectories with int64 ``keys`` ``[*B]``."""
+def step_noise(keys: Tensor, step: int | Tensor, noise_dim: int) -> Tensor:
+    """Uniforms ``[*B, noise_dim]`` of one step, for all or for each of the trajectories with int64 ``keys`` ``[*B]``."""
     first = step * noise_dim
     return torch.stack([uniform(keys, first + i) for i in range(noise_dim)], -1)
+
+
+class _Live(NamedTuple):
+    """The trajectories that are simulated now: features, keys, number in the batch and steps made."""
+
+    y: TensorDictBase
+    keys: Tensor
+    number: Tensor
+    age: Tensor
+
+    def rows(self, index: Tensor) -> _Live:
+        return _Live(take_rows(self.y, index), self.keys[index], self.number[index], self.age[index])
+
+    def join(self, other: _Live) -> _Live:
+        rest = (torch.cat([mine, theirs]) for mine, theirs in zip(self[1:], other[1:], strict=True))
+        return _Live(join_rows([self.y, other.y]), *rest)
 
 
 class TruncatedRollout(nn.Module):
@@ -34,6 +51,9 @@ class TruncatedRollout(nn.Module):
 
     :math:`\sum_{k<m}\alpha^k\hat g(y_k,\mu(y_k))+\alpha^m\hat J(y_m)`; a trajectory that reaches a terminal state ends
     there without further cost. The stage cost is the belief's expectation, not a realised cost.
+
+    At most ``chunk_rows`` trajectories are simulated at a time. As they finish, waiting ones take their place, so that
+    every step works on a full chunk whatever the trajectories' lengths.
 
     Args:
         model: the belief model.
@@ -43,9 +63,10 @@ class TruncatedRollout(nn.Module):
         max_steps: m, the largest number of steps.
         terminal_cost: :math:`\hat J`, added at the cut; None is zero, right where m is large enough for discounting or
             the terminal states to make the rest insignificant.
+        chunk_rows: largest number of trajectories simulated at once; bounds the memory, never changes the result.
 
     Raises:
-        ValueError: if ``max_steps`` is not positive.
+        ValueError: if ``max_steps`` or ``chunk_rows`` is not positive.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -64,16 +85,19 @@ class TruncatedRollout(nn.Module):
         *,
         max_steps: int = 400,
         terminal_cost: TerminalCost | None = None,
+        chunk_rows: int = 8192,
     ) -> None:
         super().__init__()
-        if max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+        for name, value in (("max_steps", max_steps), ("chunk_rows", chunk_rows)):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
         self.model, self.base_policy = model, base_policy
-        self.max_steps, self.terminal_cost = max_steps, terminal_cost
+        self.max_steps, self.terminal_cost, self.chunk_rows = max_steps, terminal_cost, chunk_rows
         # Features that nobody reads are not computed; a plain callable may read all of them.
         self._keys = tuple(getattr(base_policy, "in_keys", ())) or None
+        powers = model.discount ** torch.arange(max_steps + 1, dtype=torch.float64)
+        self.register_buffer("_discounts", powers.to(model.device, model.dtype), persistent=False)
 
-    @torch.no_grad()
     def forward(self, y: TensorDictBase, keys: Tensor) -> Tensor:
         """Cost of one trajectory from every row.
 
@@ -85,27 +109,46 @@ class TruncatedRollout(nn.Module):
             costs ``[N]``.
         """
         total = torch.zeros(keys.shape, dtype=self.model.dtype, device=keys.device)
-        live = torch.arange(keys.numel(), device=keys.device)
-        y = self.model.with_features(y, self._keys)
-        discount = 1.0
-        for step in range(self.max_steps):
-            y, keys, live, ended = self._drop_finished(y, keys, live)
-            if live.numel() == 0:
-                return total
-            u = self.base_policy(y).get("action")
-            cost, y = self.model.advance(y, u, step_noise(keys, step, self.model.noise_dim))
-            total.index_add_(0, live, cost.masked_fill(ended, 0.0), alpha=discount)
-            discount *= self.model.discount
-        if self.terminal_cost is not None:
-            rest = self.terminal_cost(y).masked_fill(self.model.is_terminal(y), 0.0)
-            total.index_add_(0, live, rest, alpha=discount)
+        with torch.inference_mode():
+            self._simulate(y, keys, total)
         return total
 
-    def _drop_finished(self, y: TensorDictBase, keys: Tensor, live: Tensor) -> tuple[TensorDictBase, Tensor, Tensor, Tensor]:
-        """Drop terminal rows once they are many; also returns which of the rows left are terminal."""
-        ended = self.model.is_terminal(y)
-        count = int(ended.sum())
-        if count <= _DROP_FRACTION * ended.numel():
-            return y, keys, live, ended
-        rest = (~ended).nonzero().squeeze(-1)
-        return take_rows(y, rest), keys[rest], live[rest], ended[rest]
+    def _simulate(self, y: TensorDictBase, keys: Tensor, total: Tensor) -> None:
+        """Add the cost of every trajectory to ``total`` ``[N]``."""
+        live, waiting = self._admit(y, keys, 0, self.chunk_rows), self.chunk_rows
+        clock, cuts = 0, {self.max_steps}
+        while True:
+            terminal = self.model.is_terminal(live.y)
+            cut = clock in cuts
+            ended = terminal | (live.age == self.max_steps) if cut else terminal
+            if cut or int(ended.sum()) > _RENEW_FRACTION * ended.numel():
+                if cut and self.terminal_cost is not None:
+                    self._add_terminal_costs(live.rows((ended & ~terminal).nonzero().squeeze(-1)), total)
+                live = live.rows((~ended).nonzero().squeeze(-1))
+                room = self.chunk_rows - live.keys.numel()
+                if room and waiting < keys.numel():
+                    live, waiting = live.join(self._admit(y, keys, waiting, waiting + room)), waiting + room
+                    cuts.add(clock + self.max_steps)
+                    continue
+                if live.keys.numel() == 0:
+                    return
+                ended = self.model.is_terminal(live.y)
+            live = self._step(live, ended, total)
+            clock += 1
+
+    def _admit(self, y: TensorDictBase, keys: Tensor, first: int, last: int) -> _Live:
+        """The trajectories number ``first`` to ``last``, at their start."""
+        number = torch.arange(first, min(last, keys.numel()), device=keys.device)
+        start = self.model.with_features(y[first:last], self._keys)
+        return _Live(start, keys[first:last], number, torch.zeros_like(number))
+
+    def _step(self, live: _Live, ended: Tensor, total: Tensor) -> _Live:
+        """One step of all live trajectories; those that have ended add no cost."""
+        u = self.base_policy(live.y).get("action")
+        cost, y = self.model.advance(live.y, u, step_noise(live.keys, live.age, self.model.noise_dim))
+        total.index_add_(0, live.number, (cost * self._discounts[live.age]).masked_fill(ended, 0.0))
+        return live._replace(y=y, age=live.age + 1)
+
+    def _add_terminal_costs(self, live: _Live, total: Tensor) -> None:
+        if live.keys.numel() and self.terminal_cost is not None:
+            total.index_add_(0, live.number, self.terminal_cost(live.y) * self._discounts[-1])
