@@ -15,7 +15,7 @@ def network(model, seed=0, encoder=FlatEncoder):
 def test_flat_encoding_holds_beliefs_and_one_hot_location(linear20):
     y = linear20.start(torch.arange(4))
     features = FlatEncoder(linear20.model)(y)
-    torch.testing.assert_close(features[:, :100].view(4, 5, 20), y["belief"].transpose(1, 2))
+    torch.testing.assert_close(features[:, :100].view(4, 20, 5), y["belief"])
     assert torch.equal(features[:, 100:].argmax(-1), y["location"][:, 0])
     assert FlatEncoder(tiger()).num_features == 2
 
@@ -24,17 +24,17 @@ def test_relative_encoding_by_hand():
     model = small_model(line(3), dtype=torch.float32)
     y = random_states(model, 6, 0)
     features = RelativeEncoder(model)(y)
-    window = features[:, :15].view(6, 3, 5)
+    window = features[:, :15].view(6, 5, 3)
     for row in range(6):
         place = int(y["location"][row, 0])
         for offset in range(-2, 3):
-            seen = window[row, :, offset + 2]
+            seen = window[row, offset + 2]
             if not 0 <= place + offset < 3:
                 assert seen.tolist() == [0, 0, 0]
                 continue
             belief = y["belief"][row, place + offset]
-            assert torch.equal(seen[:2], belief[1:])
-            assert seen[2] == float(belief[0] < 1)
+            assert seen[0] == float(belief[0] < 1)
+            assert torch.equal(seen[1:], belief[1:])
     assert torch.equal(features[:, 15:].argmax(-1), y["location"][:, 0])
 
 
@@ -45,7 +45,7 @@ def test_relative_encoding_sees_the_same_from_everywhere():
     y["location"][:] = torch.tensor([[6], [12]])
     y["belief"][0, 6 + 1] = y["belief"][1, 12 + 1] = torch.tensor([0.2, 0.3, 0.5])
     features = RelativeEncoder(model)(y)
-    assert torch.equal(features[0, :-20], features[1, :-20])
+    assert torch.equal(features[0, :-21], features[1, :-21])
 
 
 @pytest.mark.parametrize("encoder", [FlatEncoder, RelativeEncoder])

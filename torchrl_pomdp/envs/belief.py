@@ -7,7 +7,7 @@ TorchRL call :class:`BeliefEnv`, a thin skin over it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.noise import fingerprint
 
-__all__ = ["BeliefEnv", "BeliefModel", "StateGenerator", "inverse_cdf", "join_rows", "take_rows"]
+__all__ = ["BeliefEnv", "BeliefModel", "StateGenerator", "inverse_cdf", "put_rows", "take_rows"]
 
 StateGenerator = Callable[[Tensor], TensorDictBase]
 """Distribution of feature states: maps int64 keys ``[*B]`` to feature states ``[*B]``, the same key to the same state."""
@@ -59,29 +59,36 @@ def take_rows(y: TensorDictBase, index: Tensor) -> TensorDictBase:
     """
 
     def take(leaf: Tensor) -> Tensor:
-        if leaf.ndim > 1 and leaf.stride(0) == 1:
-            return leaf.movedim(0, -1).index_select(-1, index).movedim(-1, 0)
+        if _batch_innermost(leaf):
+            planes = leaf.movedim(0, -1)
+            return planes.flatten(0, -2).index_select(1, index).view(*planes.shape[:-1], -1).movedim(-1, 0)
         return leaf.index_select(0, index)
 
     return TensorDict({key: take(leaf) for key, leaf in y.items()}, batch_size=index.shape, device=y.device)
 
 
-def join_rows(batches: Sequence[TensorDictBase]) -> TensorDictBase:
-    """The rows of several flat batches, one batch after the other, each entry in the memory layout that it has first.
+def put_rows(y: TensorDictBase, index: Tensor, rows: TensorDictBase) -> TensorDictBase:
+    """The flat batch ``y`` ``[N]`` with ``rows`` ``[M]`` in the places ``index`` (int64 ``[M]``); ``y`` is left alone.
 
     Examples:
-        >>> y = TensorDict({"belief": torch.rand(3, 5).T}, [5])
-        >>> join_rows([y, y[:2]])["belief"].stride()
-        (1, 7)
+        >>> y = TensorDict({"belief": torch.zeros(3, 5).T}, [5])
+        >>> put_rows(y, torch.tensor([4]), TensorDict({"belief": torch.ones(1, 3)}, [1]))["belief"].sum(-1).tolist()
+        [0.0, 0.0, 0.0, 0.0, 3.0]
     """
 
-    def join(leaves: list[Tensor]) -> Tensor:
-        if leaves[0].ndim > 1 and leaves[0].stride(0) == 1:
-            return torch.cat([leaf.movedim(0, -1) for leaf in leaves], -1).movedim(-1, 0)
-        return torch.cat(leaves)
+    def put(leaf: Tensor, new: Tensor) -> Tensor:
+        if _batch_innermost(leaf):
+            planes = leaf.movedim(0, -1)
+            result = planes.flatten(0, -2).index_copy(1, index, new.movedim(0, -1).flatten(0, -2))
+            return result.view(planes.shape).movedim(-1, 0)
+        return leaf.index_copy(0, index, new)
 
-    joined = {key: join([batch.get(key) for batch in batches]) for key in batches[0].keys()}
-    return TensorDict(joined, batch_size=[sum(batch.batch_size[0] for batch in batches)], device=batches[0].device)
+    changed = {key: put(leaf, rows.get(key)) for key, leaf in y.items()}
+    return TensorDict(changed, batch_size=y.batch_size, device=y.device)
+
+
+def _batch_innermost(leaf: Tensor) -> bool:
+    return leaf.ndim > 1 and leaf.stride(0) == 1
 
 
 class BeliefModel(nn.Module, ABC):

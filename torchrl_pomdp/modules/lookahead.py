@@ -2,7 +2,7 @@ r"""One-step lookahead with rollout at its leaves: the policy :math:`\tilde\mu` 
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -10,19 +10,18 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf, take_rows
+from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.noise import fold, uniform
 
 __all__ = ["RolloutPolicy"]
 
-
-class _Leaves(NamedTuple):
-    """Sampled first observations: ``pair[i]`` is the state-control pair of leaf i, which counts with ``weight[i]``."""
-
-    pair: Tensor
-    trajectory: Tensor
-    observation: Tensor
-    weight: Tensor
+_LEAVES, _ALLOCATIONS = ("control", "observation"), ("uniform", "adaptive")
+# Leaves that are made at once, in chunks of the rollout: enough to keep its chunk full nearly all the time.
+_CHUNKS_PER_BLOCK = 4
+# Adaptive allocation: trajectories of the first and of every further round, and the standard errors that settle it.
+_FIRST_ROUND, _NEXT_ROUND, _CLEARLY = 3, 2, 2.0
 
 
 class RolloutPolicy(TensorDictModuleBase):
@@ -43,13 +42,17 @@ class RolloutPolicy(TensorDictModuleBase):
         leaves: what a leaf is. ``"control"``: every control gets ``trajectories`` trajectories, their first observations
             stratified over :math:`\hat p`. ``"observation"``: every (control, observation) of positive probability gets
             them, and the expectation over the first observation is exact.
+        allocation: ``"uniform"``: every control gets all trajectories. ``"adaptive"``: they are spent in rounds, and a control
+            that the best one clearly beats, by the differences of their paired trajectories, gets no more; a state whose
+            decision is settled costs nothing further.
         max_steps: m, see :class:`TruncatedRollout`.
         terminal_cost: :math:`\hat J`, see :class:`TruncatedRollout`.
         seed: seed of the simulations.
-        chunk_rows: largest number of trajectories simulated at once; bounds the memory, never changes the result.
+        chunk_rows: see :class:`TruncatedRollout`; on a CPU each of ``torch.get_num_threads()`` threads has such a chunk.
 
     Raises:
-        ValueError: if a number is not positive or ``leaves`` is unknown; when called, if a state does not fit the model.
+        ValueError: if a number is not positive, or ``leaves`` or ``allocation`` is unknown; when called, if a state does
+            not fit the model.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -70,21 +73,24 @@ class RolloutPolicy(TensorDictModuleBase):
         *,
         trajectories: int = 10,
         leaves: Literal["control", "observation"] = "control",
+        allocation: Literal["uniform", "adaptive"] = "uniform",
         max_steps: int = 400,
         terminal_cost: TerminalCost | None = None,
         seed: int = 0,
         chunk_rows: int = 8192,
     ) -> None:
         super().__init__()
-        for name, value in (("trajectories", trajectories), ("chunk_rows", chunk_rows)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
-        if leaves not in ("control", "observation"):
-            raise ValueError(f"leaves must be 'control' or 'observation', got {leaves!r}")
+        if trajectories < 1:
+            raise ValueError(f"trajectories must be at least 1, got {trajectories}")
+        for name, given, known in (("leaves", leaves, _LEAVES), ("allocation", allocation, _ALLOCATIONS)):
+            if given not in known:
+                raise ValueError(f"{name} must be one of {known}, got {given!r}")
         self.in_keys = list(model.state_keys)
         self.model = model
-        self.cost_to_go = TruncatedRollout(model, base_policy, max_steps=max_steps, terminal_cost=terminal_cost)
-        self.trajectories, self.leaves, self.seed, self.chunk_rows = trajectories, leaves, seed, chunk_rows
+        self.cost_to_go = TruncatedRollout(
+            model, base_policy, max_steps=max_steps, terminal_cost=terminal_cost, chunk_rows=chunk_rows
+        )
+        self.trajectories, self.leaves, self.allocation, self.seed = trajectories, leaves, allocation, seed
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"q_factors"`` ``[*B, U]`` (costs, ``+inf`` where illegal) and ``"action"`` ``[*B]`` (ties to the lower)."""
@@ -100,52 +106,104 @@ class RolloutPolicy(TensorDictModuleBase):
             return torch.zeros(shape, dtype=self.model.dtype, device=self.model.device)
         flat = self.model.with_features(y, ("action_mask",)).reshape(-1)
         branches = self.model.num_controls * (self.model.num_observations if self.leaves == "observation" else 1)
-        size = max(1, self.chunk_rows // (self.trajectories * branches))
-        parts = [self._q_factors(flat[start : start + size]) for start in range(0, flat.shape[0], size)]
-        q = (
-            torch.cat(parts)
-            if parts
-            else torch.zeros(0, self.model.num_controls, dtype=self.model.dtype, device=self.model.device)
-        )
-        return q.view(*y.batch_size, self.model.num_controls)
+        threads = torch.get_num_threads() if flat.device is None or flat.device.type == "cpu" else 1
+        size = max(1, _CHUNKS_PER_BLOCK * self.cost_to_go.chunk_rows // (self.trajectories * branches))
+        size = min(size, -(-flat.shape[0] // threads))
+        return torch.cat(map_threads(self._q_factors, flat.split(size), threads)).view(shape)
 
     def _q_factors(self, y: TensorDictBase) -> Tensor:
-        """Q-factors ``[N, U]`` of a flat batch that is simulated at once."""
-        model = self.model
-        state, u = y.get("action_mask").nonzero(as_tuple=True)
-        core = y.select(*model.state_keys)
+        """Q-factors ``[N, U]`` of a flat batch."""
+        mask, core = y.get("action_mask"), y.select(*self.model.state_keys)
+        each = torch.arange(self.trajectories, device=mask.device)
         # [N, n]: one key for each state and trajectory, shared by the state's controls.
-        keys = fold(fold(model.fingerprint(core), self.seed).unsqueeze(-1), self._trajectory_index)
-        pairs = take_rows(core, state)
-        leaves = self._sample_leaves(model.observation_probs(pairs, u), keys[state])
-        successors = model.estimator(take_rows(pairs, leaves.pair), u[leaves.pair], leaves.observation)
-        cost = self.cost_to_go(successors, fold(keys[state[leaves.pair], leaves.trajectory], 1)) * leaves.weight
-        expected = torch.zeros(u.shape, dtype=cost.dtype, device=cost.device).index_add_(0, leaves.pair, cost)
-        q = torch.full(y.get("action_mask").shape, torch.inf, dtype=cost.dtype, device=cost.device)
-        q[state, u] = model.expected_cost(pairs, u) + model.discount * expected
-        return q
+        keys = fold(fold(self.model.fingerprint(core), self.seed).unsqueeze(-1), each)
+        costs = torch.full((self.trajectories, *mask.shape), torch.nan, dtype=self.model.dtype, device=mask.device)
+        rivals, spent = mask, 0
+        for count in self._rounds():
+            state, u = rivals.nonzero(as_tuple=True)
+            if state.numel() == 0:
+                break
+            members = spread(self.trajectories)[spent : spent + count].to(mask.device)
+            spent += count
+            costs[spent - count : spent, state, u] = self._trajectory_costs(core, state, u, members, keys)
+            rivals = _rivals(costs[:spent], rivals)
+        return _combine(costs, mask)
 
-    @property
-    def _trajectory_index(self) -> Tensor:
-        return torch.arange(self.trajectories, device=self.model.device)
+    def _rounds(self) -> list[int]:
+        """Numbers of trajectories of each control that are simulated one after the other."""
+        if self.allocation == "uniform":
+            return [self.trajectories]
+        first = min(_FIRST_ROUND, self.trajectories)
+        rest = self.trajectories - first
+        return [first] + [min(_NEXT_ROUND, rest - i) for i in range(0, rest, _NEXT_ROUND)]
 
-    def _sample_leaves(self, probs: Tensor, keys: Tensor) -> _Leaves:
-        """First observations of P pairs from their probabilities ``[P, Z]`` and keys ``[P, n]``."""
-        count = self.trajectories
+    def _trajectory_costs(self, core: TensorDictBase, state: Tensor, u: Tensor, members: Tensor, keys: Tensor) -> Tensor:
+        r""":math:`\hat g(y,u)+\alpha\tilde J` for P state-control pairs and the trajectories ``members`` ``[n]``: ``[n, P]``."""
+        model, pairs = self.model, take_rows(core, state)
+        pair, trajectory, observation, weight = self._leaves(model.observation_probs(pairs, u), members, keys[state])
+        successors = model.estimator(take_rows(pairs, pair), u[pair], observation)
+        cost = self.cost_to_go(successors, fold(keys[state[pair], members[trajectory]], 1)) * weight
+        total = torch.zeros(members.numel() * u.numel(), dtype=cost.dtype, device=cost.device)
+        total.index_add_(0, trajectory * u.numel() + pair, cost)
+        return model.expected_cost(pairs, u) + model.discount * total.view(members.numel(), -1)
+
+    def _leaves(self, probs: Tensor, members: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """First observations of P pairs from their probabilities ``[P, Z]`` and keys ``[P, n]``.
+
+        Returns for every leaf its pair, the place of its trajectory in ``members``, the observation, and its weight.
+        """
+        count = members.numel()
         if self.leaves == "observation":
             pair, observation = (probs > 0).nonzero(as_tuple=True)
-            weight = probs[pair, observation] / count
-            each = self._trajectory_index.repeat(pair.numel())
-            return _Leaves(
-                pair.repeat_interleave(count),
-                each,
-                observation.repeat_interleave(count),
-                weight.repeat_interleave(count),
-            )
-        # Trajectory j draws from the j-th of n equal slices of the distribution function.
-        noise = (self._trajectory_index + uniform(keys, 0)) / count
-        observation = inverse_cdf(probs.unsqueeze(1).expand(-1, count, -1), noise)
-        pair = torch.arange(probs.shape[0], device=probs.device).repeat_interleave(count)
-        each = self._trajectory_index.repeat(probs.shape[0])
-        weight = torch.full(pair.shape, 1.0 / count, dtype=probs.dtype, device=probs.device)
-        return _Leaves(pair, each, observation.flatten(), weight)
+            weight = probs[pair, observation]
+        else:
+            # Trajectory j draws from the j-th of all n equal slices of the distribution function.
+            noise = (members + uniform(keys[:, members], 0)) / self.trajectories
+            observation = inverse_cdf(probs.unsqueeze(1).expand(-1, count, -1), noise).flatten()
+            pair = torch.arange(probs.shape[0], device=probs.device).repeat_interleave(count)
+            each = torch.arange(count, device=probs.device).repeat(probs.shape[0])
+            return pair, each, observation, torch.ones_like(pair, dtype=probs.dtype)
+        each = torch.arange(count, device=probs.device).repeat(pair.numel())
+        return pair.repeat_interleave(count), each, observation.repeat_interleave(count), weight.repeat_interleave(count)
+
+
+def _rivals(costs: Tensor, rivals: Tensor) -> Tensor:
+    """Which controls ``[N, U]`` may still be best, given their paired costs ``[k, N, U]``; none where only one may.
+
+    A control is beaten when the mean of its paired differences to the best one exceeds its standard error enough.
+    """
+    count = costs.shape[0]
+    if count < 2:
+        return rivals
+    mean = (sum_first(costs.clone()) / count).masked_fill(~rivals, torch.inf)
+    difference = costs - costs.gather(-1, mean.argmin(-1, keepdim=True).expand(count, -1, 1))
+    gap = sum_first(difference.clone()) / count
+    variance = sum_first((difference - gap).square()) / (count - 1)
+    left = rivals & ~(gap > _CLEARLY * (variance / count).sqrt())
+    return left & (left.sum(-1, keepdim=True) > 1)
+
+
+def _combine(costs: Tensor, mask: Tensor) -> Tensor:
+    """Q-factors ``[N, U]`` from the costs ``[n, N, U]`` of the trajectories that were simulated (the others are NaN).
+
+    A control that got fewer trajectories than the best one has the best one's Q-factor plus the mean difference of the
+    trajectories that both have: the noise that they share cancels.
+    """
+    made = ~costs.isnan()
+    count = made.sum(0)
+    mean = (sum_first(costs.nan_to_num(0.0)) / count).masked_fill(~mask, torch.inf)
+    most = count.amax(-1, keepdim=True)
+    best = mean.masked_fill(count < most, torch.inf).argmin(-1, keepdim=True)
+    reference = costs.gather(-1, best.expand(costs.shape[0], -1, 1))
+    gap = sum_first((costs - reference).nan_to_num(0.0)) / count
+    return torch.where((count < most) & mask, mean.gather(-1, best) + gap, mean)
+
+
+def spread(count: int) -> Tensor:
+    """The numbers 0..count-1 in an order of which every beginning is spread evenly (by the golden ratio).
+
+    Examples:
+        >>> spread(10).tolist()
+        [0, 6, 2, 8, 4, 1, 7, 3, 9, 5]
+    """
+    return (torch.arange(count, dtype=torch.float64) * 0.6180339887498949 % 1.0).argsort().argsort()

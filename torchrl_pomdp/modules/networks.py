@@ -2,6 +2,7 @@ r"""Encoders of the feature state and the policy network :math:`\hat\mu(y,r)` (p
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -28,11 +29,17 @@ class Encoder(nn.Module):
     keys: tuple[str, ...]
     num_features: int
 
+    def forward(self, y: TensorDictBase) -> Tensor:
+        """Features ``[*B, F]`` of feature states ``[*B]``."""
+        return self.encode_rows(y.reshape(-1), None).reshape(*y.batch_size, self.num_features)
+
+    @abstractmethod
+    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
+        """Features ``[M, F]`` of the rows ``rows`` (int64 ``[M]``, in that order; None: all) of a flat batch ``[N]``."""
+
 
 class FlatEncoder(Encoder):
     """The paper's encoding, for any model: real entries flattened, integer entries one-hot.
-
-    The dimensions of a real entry are flattened last first, so that beliefs kept as planes need no transposition.
 
     Args:
         model: the belief model.
@@ -50,32 +57,30 @@ class FlatEncoder(Encoder):
         spec = model.state_spec()
         self.keys = model.state_keys
         self.classes = {key: leaf.n if isinstance(leaf, Categorical) else None for key, leaf in spec.items()}
-        self.num_dims = {key: len(leaf.shape) for key, leaf in spec.items()}
         self.num_features = sum(leaf.shape.numel() * (self.classes[key] or 1) for key, leaf in spec.items())
-        self.dtype = next(leaf.dtype for leaf in spec.values() if leaf.dtype.is_floating_point)
+        self.dtype = model.dtype
 
-    def forward(self, y: TensorDictBase) -> Tensor:
-        """Features ``[*B, F]`` of feature states ``[*B]``."""
-        size = y.batch_size.numel()
+    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
+        """See :class:`Encoder`."""
         blocks = []
         for key in self.keys:
-            leaf = y.get(key)
-            leaf = leaf.reshape(size, *leaf.shape[leaf.ndim - self.num_dims[key] :])
-            leaf = leaf.permute(*range(leaf.ndim - 1, -1, -1))
+            # [., N] and its transpose: entries kept as planes are turned by one fast transposition.
+            leaf = y.get(key).movedim(0, -1).flatten(0, -2)
             classes = self.classes[key]
             if classes is not None:
-                leaf = leaf.unsqueeze(0) == torch.arange(classes, device=leaf.device).view(-1, *([1] * leaf.ndim))
-            blocks.append(leaf.reshape(-1, size).to(self.dtype))
-        return torch.cat(blocks).T.reshape(*y.batch_size, self.num_features)
+                leaf = (leaf.unsqueeze(1) == torch.arange(classes, device=leaf.device).unsqueeze(-1)).flatten(0, 1)
+            blocks.append(leaf.to(self.dtype))
+        features = torch.cat(blocks).T.contiguous()
+        return features if rows is None else features.index_select(0, rows)
 
 
 class RelativeEncoder(Encoder):
     """The repair problem as each robot sees it: what is known of the location at every offset from the robot.
 
     What to do with damage two steps to the left hardly depends on where on the pipeline the robot stands; with a window
-    centred at the robot the network need not learn it anew for each location. Channels of an offset are the
-    probabilities of the damaged levels and whether damage is possible at all; offsets outside the graph are zero. The
-    robots' locations follow, one-hot.
+    centred at the robot the network need not learn it anew for each location. An offset has K features: whether damage is
+    possible at all and the probabilities of the damaged levels; offsets outside the graph are zero. The robot's location
+    follows, one-hot and filled with zeros to a multiple of K.
 
     Args:
         model: the repair model; offsets are differences of its graph's columns and rows.
@@ -89,32 +94,46 @@ class RelativeEncoder(Encoder):
     """
 
     keys = ("belief", "location")
-    window: Tensor
+    slots: Tensor
 
     def __init__(self, model: RepairModel) -> None:
         super().__init__()
         self.num_levels, self.num_locations, self.num_robots = model.num_levels, model.num_locations, model.num_robots
-        self.register_buffer("window", _window(model.graph).to(model.device), persistent=False)
-        places = self.window.shape[0] * self.num_levels + self.num_locations
-        self.num_features = self.num_robots * places
+        # Every row has a table of slots of K numbers: the locations, one for all places outside, each robot's place.
+        self.place_slots = -(-self.num_locations // self.num_levels)
+        self.num_slots = self.num_locations + 1 + self.num_robots * self.place_slots
+        window = _window(model.graph).T.unsqueeze(0).expand(self.num_robots, -1, -1)
+        places = self._first_place_slots().view(-1, 1, 1) + torch.arange(self.place_slots)
+        slots = torch.cat([window, places.expand(-1, self.num_locations, -1)], -1)
+        # [R, L, S]: the slots that robot r reads at location l.
+        self.register_buffer("slots", slots.to(model.device), persistent=False)
+        self.num_features = self.num_robots * slots.shape[-1] * self.num_levels
 
-    def forward(self, y: TensorDictBase) -> Tensor:
-        """Features ``[*B, F]`` of feature states ``[*B]``."""
-        location = y.get("location").reshape(-1, self.num_robots).T
-        planes = y.get("belief").reshape(-1, self.num_locations, self.num_levels).permute(2, 1, 0)
-        size = planes.shape[-1]
-        # [K, L + 1, N]: damaged levels and possible damage; the last location stands for all outside the graph.
-        channels = planes.new_zeros(self.num_levels, self.num_locations + 1, size)
-        channels[:-1, :-1] = planes[1:]
-        channels[-1, :-1] = 1.0 - planes[0].floor()
-        rows = torch.arange(size, device=planes.device)
-        places = torch.arange(self.num_locations, device=planes.device).unsqueeze(-1)
+    def _first_place_slots(self) -> Tensor:
+        return self.num_locations + 1 + torch.arange(self.num_robots) * self.place_slots
+
+    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
+        """See :class:`Encoder`."""
+        location = y.get("location").T
+        table = self._table(y.get("belief"), location)
+        rows = torch.arange(table.shape[0], device=table.device) if rows is None else rows
         blocks = []
-        for robot in location:
-            index = (self.window.index_select(1, robot) * size + rows).flatten()
-            blocks.append(channels.flatten(1).index_select(1, index).view(-1, size))
-            blocks.append((places == robot).to(planes.dtype))
-        return torch.cat(blocks).T.reshape(*y.batch_size, self.num_features)
+        for robot, slots in enumerate(self.slots):
+            index = slots.index_select(0, location[robot, rows]) + (rows * self.num_slots).unsqueeze(-1)
+            block = table.view(-1, self.num_levels).index_select(0, index.flatten())
+            blocks.append(block.view(rows.numel(), -1))
+        return blocks[0] if len(blocks) == 1 else torch.cat(blocks, -1)
+
+    def _table(self, belief: Tensor, location: Tensor) -> Tensor:
+        """Slots of every row, ``[N, num_slots * K]``."""
+        planes = belief.permute(1, 2, 0)
+        table = planes.new_zeros(self.num_slots, self.num_levels, planes.shape[-1])
+        table[: self.num_locations, 0] = 1.0 - planes[:, 0].floor()
+        table[: self.num_locations, 1:] = planes[:, 1:]
+        for robot, first in enumerate(self._first_place_slots().tolist()):
+            table[first : first + self.place_slots].flatten(0, 1).scatter_(0, location[robot : robot + 1], 1.0)
+        # A transposition of two dimensions is much faster than a general permutation.
+        return table.flatten(0, 1).T.contiguous()
 
 
 class PolicyNetwork(TensorDictModuleBase):
@@ -147,9 +166,12 @@ class PolicyNetwork(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"logits"`` ``[*B, U]`` (``-inf`` where illegal) and the most probable ``"action"`` ``[*B]``."""
-        logits = _rowwise(self.network, self.encoder(tensordict))
-        logits = logits.masked_fill(~tensordict.get("action_mask"), -torch.inf)
+        logits = self.logits(self.encoder(tensordict), tensordict.get("action_mask"))
         return tensordict.update({"logits": logits, "action": logits.argmax(-1)})
+
+    def logits(self, features: Tensor, action_mask: Tensor) -> Tensor:
+        """Logits ``[*B, U]`` from features ``[*B, F]``, ``-inf`` where ``action_mask`` ``[*B, U]`` is False."""
+        return _rowwise(self.network, features).masked_fill(~action_mask, -torch.inf)
 
 
 def _relu_network(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequential:
@@ -159,7 +181,7 @@ def _relu_network(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequen
         layer = nn.utils.skip_init(nn.Linear, fan_in, fan_out, device=generator.device)
         for parameter in layer.parameters():
             nn.init.uniform_(parameter, -(fan_in**-0.5), fan_in**-0.5, generator=generator)
-        layers += [layer, nn.ReLU()]
+        layers += [layer, nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
 
 

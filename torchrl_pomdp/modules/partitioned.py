@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_pomdp.envs.belief import take_rows
+from torchrl_pomdp.modules.networks import PolicyNetwork
 
 __all__ = ["PartitionedPolicy"]
 
@@ -40,9 +41,15 @@ class PartitionedPolicy(TensorDictModuleBase):
         if not policies:
             raise ValueError("policies is empty: a partitioned policy needs one policy for each part")
         self.policies = nn.ModuleList(policies)
-        # A policy that is local to several parts is called once for all of them.
-        self._distinct = list(dict.fromkeys(policies))
-        self.register_buffer("_policy_of_part", torch.tensor([self._distinct.index(p) for p in policies]), persistent=False)
+        # A policy that is local to several parts is called once for all of them. Networks that read the same features
+        # come last, so that their rows are neighbours once the batch is sorted by policy.
+        distinct = dict.fromkeys(policies)
+        encoders = {policy.encoder: None for policy in distinct if isinstance(policy, PolicyNetwork)}
+        self._encoder = next(iter(encoders)) if len(encoders) == 1 else None
+        self._networks = [p for p in distinct if isinstance(p, PolicyNetwork) and self._encoder is not None]
+        self._others = [p for p in distinct if p not in self._networks]
+        numbers = {policy: number for number, policy in enumerate([*self._others, *self._networks])}
+        self.register_buffer("_policy_of_part", torch.tensor([numbers[p] for p in policies]), persistent=False)
         read = {str(key): None for policy in policies for key in policy.in_keys}
         self.in_keys = [*read, "partition"]
         written = [set(policy.out_keys) for policy in policies]
@@ -54,15 +61,33 @@ class PartitionedPolicy(TensorDictModuleBase):
         if part.numel() and not 0 <= int(part.min()) <= int(part.max()) < len(self.policies):
             raise ValueError(f"partition must hold parts 0..{len(self.policies) - 1}, got {part.unique().tolist()}")
         flat = tensordict.select(*self.in_keys).reshape(-1)
-        if len(self._distinct) == 1:
-            result = self._distinct[0](flat).select(*self.out_keys)
+        if not self._networks and len(self._others) == 1:
+            result = self._others[0](flat).select(*self.out_keys)
         else:
-            chosen = self._policy_of_part[part]
-            present = chosen.unique().tolist()
-            rows = [(chosen == number).nonzero().squeeze(-1) for number in present]
-            outputs = [
-                self._distinct[number](take_rows(flat, index)).select(*self.out_keys)
-                for number, index in zip(present, rows, strict=True)
-            ]
-            result = torch.cat(outputs, 0)[torch.cat(rows).argsort()]
+            result = self._route(flat, self._policy_of_part[part])
         return tensordict.update(result.reshape(tensordict.batch_size))
+
+    def _route(self, y: TensorDictBase, chosen: Tensor) -> TensorDictBase:
+        """Outputs of the policies number ``chosen`` ``[N]`` at the rows of ``y`` ``[N]``."""
+        order = chosen.argsort(stable=True)
+        counts = chosen.bincount(minlength=len(self._others) + len(self._networks)).tolist()
+        rows = order.split(counts)
+        outputs = [
+            policy(take_rows(y, index)).select(*self.out_keys)
+            for policy, index in zip(self._others, rows, strict=False)
+            if index.numel()
+        ]
+        split = len(self._others)
+        outputs += self._decide(y, order[sum(counts[:split]) :], counts[split:])
+        joined = torch.cat(outputs, 0)
+        return TensorDict({key: torch.empty_like(leaf).index_copy(0, order, leaf) for key, leaf in joined.items()}, y.batch_size)
+
+    def _decide(self, y: TensorDictBase, rows: Tensor, counts: list[int]) -> list[TensorDictBase]:
+        """Outputs of the networks at ``rows``, of which each network has the next ``counts``; features are made once."""
+        if self._encoder is None or rows.numel() == 0:
+            return []
+        features = self._encoder.encode_rows(y, None if len(counts) == 1 and not self._others else rows).split(counts)
+        masks = y.get("action_mask").index_select(0, rows).split(counts)
+        blocks = zip(self._networks, features, masks, strict=True)
+        logits = torch.cat([network.logits(x, mask) for network, x, mask in blocks if len(x)])
+        return [TensorDict({"logits": logits, "action": logits.argmax(-1)}, rows.shape).select(*self.out_keys)]

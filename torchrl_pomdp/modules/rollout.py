@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_pomdp.envs.belief import BeliefModel, join_rows, take_rows
+from torchrl_pomdp.envs.belief import BeliefModel, put_rows, take_rows
 from torchrl_pomdp.noise import uniform
 
 __all__ = ["Policy", "TerminalCost", "TruncatedRollout", "step_noise"]
@@ -38,12 +38,13 @@ class _Live(NamedTuple):
     number: Tensor
     age: Tensor
 
-    def rows(self, index: Tensor) -> _Live:
+    def rows(self, chosen: Tensor) -> _Live:
+        index = chosen.nonzero().squeeze(-1)
         return _Live(take_rows(self.y, index), self.keys[index], self.number[index], self.age[index])
 
-    def join(self, other: _Live) -> _Live:
-        rest = (torch.cat([mine, theirs]) for mine, theirs in zip(self[1:], other[1:], strict=True))
-        return _Live(join_rows([self.y, other.y]), *rest)
+    def replace_rows(self, index: Tensor, other: _Live) -> _Live:
+        rest = (mine.index_copy(0, index, theirs) for mine, theirs in zip(self[1:], other[1:], strict=True))
+        return _Live(put_rows(self.y, index, other.y), *rest)
 
 
 class TruncatedRollout(nn.Module):
@@ -118,21 +119,20 @@ class TruncatedRollout(nn.Module):
         live, waiting = self._admit(y, keys, 0, self.chunk_rows), self.chunk_rows
         clock, cuts = 0, {self.max_steps}
         while True:
-            terminal = self.model.is_terminal(live.y)
-            cut = clock in cuts
-            ended = terminal | (live.age == self.max_steps) if cut else terminal
+            ended, cut = self._ended(live), clock in cuts
             if cut or int(ended.sum()) > _RENEW_FRACTION * ended.numel():
-                if cut and self.terminal_cost is not None:
-                    self._add_terminal_costs(live.rows((ended & ~terminal).nonzero().squeeze(-1)), total)
-                live = live.rows((~ended).nonzero().squeeze(-1))
-                room = self.chunk_rows - live.keys.numel()
-                if room and waiting < keys.numel():
-                    live, waiting = live.join(self._admit(y, keys, waiting, waiting + room)), waiting + room
+                if cut:
+                    self._add_terminal_costs(live.rows(live.age == self.max_steps), total)
+                free = ended.nonzero().squeeze(-1)[: max(0, keys.numel() - waiting)]
+                if free.numel():
+                    live = live.replace_rows(free, self._admit(y, keys, waiting, waiting + free.numel()))
+                    waiting += free.numel()
                     cuts.add(clock + self.max_steps)
-                    continue
+                    ended = self._ended(live)
+                if waiting >= keys.numel():
+                    live, ended = live.rows(~ended), ended[~ended]
                 if live.keys.numel() == 0:
                     return
-                ended = self.model.is_terminal(live.y)
             live = self._step(live, ended, total)
             clock += 1
 
@@ -149,6 +149,11 @@ class TruncatedRollout(nn.Module):
         total.index_add_(0, live.number, (cost * self._discounts[live.age]).masked_fill(ended, 0.0))
         return live._replace(y=y, age=live.age + 1)
 
+    def _ended(self, live: _Live) -> Tensor:
+        return self.model.is_terminal(live.y) | (live.age == self.max_steps)
+
     def _add_terminal_costs(self, live: _Live, total: Tensor) -> None:
-        if live.keys.numel() and self.terminal_cost is not None:
-            total.index_add_(0, live.number, self.terminal_cost(live.y) * self._discounts[-1])
+        """Cut trajectories get the terminal cost, unless they have just reached a terminal state."""
+        if self.terminal_cost is not None and live.keys.numel():
+            cost = self.terminal_cost(live.y).masked_fill(self.model.is_terminal(live.y), 0.0)
+            total.index_add_(0, live.number, cost * self._discounts[-1])
