@@ -108,8 +108,9 @@ class RepairPartition(Partition):
         belief, location = y.get("belief"), y.get("location")
         # A view [L, K, *B]: the model keeps the batch innermost.
         planes = belief.movedim((-2, -1), (0, 1))
-        num_damaged = (planes[:, 0] < 1.0 - self.damage_threshold).sum(0)
-        endgame = 2 * num_damaged < belief.shape[-2]
+        # floor is exact and, like all arithmetic, much faster than comparisons of this size.
+        num_intact = sum_first((planes[:, 0] + self.damage_threshold).floor())
+        endgame = 2 * num_intact > belief.shape[-2]
         return 3 * endgame.to(torch.int64) + self._density(planes, location)
 
     def _density(self, planes: Tensor, location: Tensor) -> Tensor:
@@ -117,7 +118,9 @@ class RepairPartition(Partition):
         cost = location_costs(planes, self._prices)
         column = self.columns.view(-1, *([1] * (cost.ndim - 1)))
         centre = self.columns[location].mean(-1)
-        left, right = sum_first(cost * (column < centre)), sum_first(cost * (column > centre))
+        # 1 left of the robots, 0 at and right of them: their mean column is a multiple of 1 / R.
+        side = (centre - column) * location.shape[-1]
+        left, right = sum_first(cost * side.clamp(0, 1)), sum_first(cost * side.neg_().clamp_(0, 1))
         low, high = self.density_bounds
         total = left + right
         # Cross-multiplied, so that no damage on either side (total = 0) is balanced.

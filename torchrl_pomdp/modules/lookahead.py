@@ -77,7 +77,7 @@ class RolloutPolicy(TensorDictModuleBase):
         max_steps: int = 400,
         terminal_cost: TerminalCost | None = None,
         seed: int = 0,
-        chunk_rows: int = 8192,
+        chunk_rows: int = 16384,
     ) -> None:
         super().__init__()
         if trajectories < 1:

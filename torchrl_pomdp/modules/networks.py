@@ -94,46 +94,55 @@ class RelativeEncoder(Encoder):
     """
 
     keys = ("belief", "location")
+    shared: Tensor
     slots: Tensor
+    stride: Tensor
 
     def __init__(self, model: RepairModel) -> None:
         super().__init__()
         self.num_levels, self.num_locations, self.num_robots = model.num_levels, model.num_locations, model.num_robots
-        # Every row has a table of slots of K numbers: the locations, one for all places outside, each robot's place.
-        self.place_slots = -(-self.num_locations // self.num_levels)
-        self.num_slots = self.num_locations + 1 + self.num_robots * self.place_slots
-        window = _window(model.graph).T.unsqueeze(0).expand(self.num_robots, -1, -1)
-        places = self._first_place_slots().view(-1, 1, 1) + torch.arange(self.place_slots)
-        slots = torch.cat([window, places.expand(-1, self.num_locations, -1)], -1)
-        # [R, L, S]: the slots that robot r reads at location l.
-        self.register_buffer("slots", slots.to(model.device), persistent=False)
+        # Slots are K numbers. First come those that all rows share: the outside and every place, one-hot; then a row's
+        # locations, one row after the other.
+        place_slots = -(-self.num_locations // self.num_levels)
+        shared = torch.zeros(1 + self.num_locations, place_slots * self.num_levels)
+        shared[1:, : self.num_locations] = torch.eye(self.num_locations)
+        shared = shared.view(-1, self.num_levels)[place_slots - 1 :]
+        window = _window(model.graph).T
+        own = window < self.num_locations
+        places = 1 + torch.arange(self.num_locations * place_slots).view(-1, place_slots)
+        slots = torch.cat([(window + len(shared)).masked_fill(~own, 0), places], -1)
+        tables = {
+            "shared": shared.to(model.dtype),
+            # [L, S]: the slots that a robot at a location reads in row 0, and by how much they move from row to row.
+            "slots": slots.to(torch.int32),
+            "stride": torch.cat([own * self.num_locations, torch.zeros_like(places)], -1).to(torch.int32),
+        }
+        for name, value in tables.items():
+            self.register_buffer(name, value.to(model.device), persistent=False)
         self.num_features = self.num_robots * slots.shape[-1] * self.num_levels
-
-    def _first_place_slots(self) -> Tensor:
-        return self.num_locations + 1 + torch.arange(self.num_robots) * self.place_slots
 
     def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
         """See :class:`Encoder`."""
-        location = y.get("location").T
-        table = self._table(y.get("belief"), location)
-        rows = torch.arange(table.shape[0], device=table.device) if rows is None else rows
+        table, location = self._table(y.get("belief")), y.get("location").T
+        rows = torch.arange(location.shape[-1], device=location.device) if rows is None else rows
         blocks = []
-        for robot, slots in enumerate(self.slots):
-            index = slots.index_select(0, location[robot, rows]) + (rows * self.num_slots).unsqueeze(-1)
-            block = table.view(-1, self.num_levels).index_select(0, index.flatten())
-            blocks.append(block.view(rows.numel(), -1))
+        for robot in location:
+            place = robot[rows]
+            slots = self.slots.index_select(0, place)
+            slots.addcmul_(self.stride.index_select(0, place), rows.unsqueeze(-1).to(torch.int32))
+            blocks.append(table.index_select(0, slots.flatten()).view(rows.numel(), -1))
         return blocks[0] if len(blocks) == 1 else torch.cat(blocks, -1)
 
-    def _table(self, belief: Tensor, location: Tensor) -> Tensor:
-        """Slots of every row, ``[N, num_slots * K]``."""
-        planes = belief.permute(1, 2, 0)
-        table = planes.new_zeros(self.num_slots, self.num_levels, planes.shape[-1])
-        table[: self.num_locations, 0] = 1.0 - planes[:, 0].floor()
-        table[: self.num_locations, 1:] = planes[:, 1:]
-        for robot, first in enumerate(self._first_place_slots().tolist()):
-            table[first : first + self.place_slots].flatten(0, 1).scatter_(0, location[robot : robot + 1], 1.0)
+    def _table(self, belief: Tensor) -> Tensor:
+        """The shared slots, then those of every row of ``belief`` ``[N, L, K]``."""
+        size, first = belief.shape[0], len(self.shared)
+        table = belief.new_empty(first + size * self.num_locations, self.num_levels)
+        table[:first] = self.shared
         # A transposition of two dimensions is much faster than a general permutation.
-        return table.flatten(0, 1).T.contiguous()
+        planes = belief.permute(1, 2, 0).flatten(0, 1)
+        own = table[first:].view(size, -1).copy_(planes.T).view(belief.shape)
+        own[..., 0] = 1.0 - belief[..., 0].floor()
+        return table
 
 
 class PolicyNetwork(TensorDictModuleBase):

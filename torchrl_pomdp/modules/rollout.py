@@ -86,7 +86,7 @@ class TruncatedRollout(nn.Module):
         *,
         max_steps: int = 400,
         terminal_cost: TerminalCost | None = None,
-        chunk_rows: int = 8192,
+        chunk_rows: int = 16384,
     ) -> None:
         super().__init__()
         for name, value in (("max_steps", max_steps), ("chunk_rows", chunk_rows)):
