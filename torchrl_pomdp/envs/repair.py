@@ -135,7 +135,7 @@ class RepairModel(BeliefModel):
         }
         for name, value in tables.items():
             self.register_buffer(name, value.to(device), persistent=False)
-        self._prices = tuple(costs.tolist())
+        self._prices, self._chain_rows = tuple(costs.tolist()), chain.tolist()
         self._stay = self.chain.diagonal().view(-1, 1)
         self._diagonals = list(_off_diagonals(self.chain))
 
@@ -216,16 +216,12 @@ class RepairModel(BeliefModel):
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
         """Joint distribution of the robots' observed levels, ``[*B, K^R]``."""
-        planes, location, repaired = self._transition(y, u)
-        for robot in range(self.num_robots):
-            # A repaired location is at level 0 for every robot that stands there; a repairing robot has not moved.
-            levels = self._levels_at(planes, location[robot])
-            intact = torch.eq(self._levels, 0).to(self.dtype)
-            self._put(planes, location[robot], torch.where(repaired[robot], intact, levels))
+        location, repaired = self._move(y, u)
+        columns = self._columns(self._planes(y), location, repaired)
         digits = _digits(torch.arange(self.num_observations, device=self.device), self.num_levels, self.num_robots)
-        joint = torch.ones(self.num_observations, planes.shape[-1], dtype=self.dtype, device=self.device)
-        for robot in range(self.num_robots):
-            factor = self._levels_at(planes, location[robot])[digits[:, robot]]
+        joint = torch.ones(self.num_observations, location.shape[-1], dtype=self.dtype, device=self.device)
+        for robot, column in enumerate(columns):
+            factor = column[digits[:, robot]]
             for other in range(robot):
                 # Robots that stand together see the same level: the later one's observation is certain.
                 together = location[robot] == location[other]
@@ -236,18 +232,17 @@ class RepairModel(BeliefModel):
 
     def estimator(self, y: TensorDictBase, u: Tensor, z: Tensor) -> TensorDictBase:
         """F(y, u, z): degrade, then set the levels observed where the robots now stand (0 after a repair)."""
-        planes, location, _ = self._transition(y, u)
-        levels = _digits(z.reshape(-1), self.num_levels, self.num_robots)
-        for robot in range(self.num_robots):
-            self._set_level(planes, location[robot], levels[:, robot])
-        return self._successor(y, planes, location)
+        location, _ = self._move(y, u)
+        levels = _digits(z.reshape(-1), self.num_levels, self.num_robots).T
+        return self._successor(y, self._next_planes(self._planes(y), location, levels), location)
 
     def advance(self, y: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase]:
         """One sampled step; robot r observes with ``noise[..., r]``. See :meth:`BeliefModel.advance`."""
-        cost = self._stage_cost(self._planes(y)).view(y.batch_size)
-        planes, location, repaired = self._transition(y, u)
-        self._observe(planes, location, noise, repaired)
-        return cost, self._successor(y, planes, location)
+        planes = self._planes(y)
+        location, repaired = self._move(y, u)
+        levels = self._draw_levels(self._columns(planes, location, repaired), location, noise)
+        cost = self._stage_cost(planes).view(y.batch_size)
+        return cost, self._successor(y, self._next_planes(planes, location, levels), location)
 
     def observe(self, y: TensorDictBase, noise: Tensor) -> TensorDictBase:
         """Observe the levels where the robots stand, without a control: for start states.
@@ -257,8 +252,8 @@ class RepairModel(BeliefModel):
             noise: uniforms ``[*B, R]``.
         """
         planes, location = self._planes(y).clone(), y.get("location").reshape(-1, self.num_robots).T
-        self._observe(planes, location, noise, torch.zeros_like(location, dtype=torch.bool))
-        return self._successor(y, planes, location)
+        levels = self._draw_levels([self._levels_at(planes, place) for place in location], location, noise)
+        return self._successor(y, self._set_levels(planes, location, levels), location)
 
     def degrade(self, belief: Tensor, steps: int = 1) -> Tensor:
         """Marginals ``[..., K]`` after ``steps`` steps of the chain without repairs or observations."""
@@ -274,37 +269,77 @@ class RepairModel(BeliefModel):
     def _stage_cost(self, planes: Tensor) -> Tensor:
         return sum_first(location_costs(planes, self._prices))
 
-    def _transition(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Degraded planes, and for each robot ``[R, N]`` its new location and whether it repairs there."""
+    def _move(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor]:
+        """For each robot ``[R, N]`` its new location and whether it repairs there."""
         origin = y.get("location").reshape(-1, self.num_robots).T
         controls = _digits(u.reshape(-1), self.num_robot_controls, self.num_robots).T
-        location = self.destinations.flatten()[origin * self.num_robot_controls + controls]
-        return self._degrade_planes(self._planes(y)), location, controls == REPAIR
+        return self.destinations.flatten()[origin * self.num_robot_controls + controls], controls == REPAIR
+
+    def _columns(self, planes: Tensor, location: Tensor, repaired: Tensor) -> list[Tensor]:
+        """For each robot the marginal ``[K, N]`` of its new location at the next stage, before it observes."""
+        intact = torch.eq(self._levels, 0).to(self.dtype)
+        columns = []
+        for robot, place in enumerate(location):
+            column = self._degrade_planes(self._levels_at(planes, place).unsqueeze(0)).squeeze(0)
+            # Repairs hold for every robot there: one that repairs has not moved.
+            fixed = repaired[robot]
+            for other in range(self.num_robots):
+                if other != robot:
+                    fixed = fixed | (repaired[other] & (location[other] == place))
+            columns.append(torch.where(fixed, intact, column))
+        return columns
+
+    def _draw_levels(self, columns: list[Tensor], location: Tensor, noise: Tensor) -> Tensor:
+        """Levels ``[R, N]`` that the robots see; those that stand together see the same."""
+        uniforms = noise.reshape(-1, self.num_robots)
+        levels: list[Tensor] = []
+        for robot, column in enumerate(columns):
+            level = inverse_cdf(column, uniforms[:, robot], dim=0)
+            for other in range(robot):
+                level = torch.where(location[robot] == location[other], levels[other], level)
+            levels.append(level)
+        return torch.stack(levels)
+
+    def _next_planes(self, planes: Tensor, location: Tensor, levels: Tensor) -> Tensor:
+        """Planes one step of the chain later, with ``levels`` ``[R, N]`` certain at ``location`` ``[R, N]``."""
+        if not torch.compiler.is_compiling():
+            return self._set_levels(self._degrade_planes(planes), location, levels)
+        # Written level by level, with choices for scatters, the compiler makes one pass of it.
+        places = torch.arange(self.num_locations, dtype=self.dtype, device=planes.device).unsqueeze(-1)
+        here = [places == place.to(self.dtype) for place in location]
+        result = []
+        for k in range(self.num_levels):
+            plane = self._next_level(planes, k)
+            for at, level in zip(here, levels, strict=True):
+                plane = torch.where(at, (level == k).to(self.dtype), plane)
+            result.append(plane)
+        return torch.stack(result, 1)
+
+    def _next_level(self, planes: Tensor, level: int) -> Tensor:
+        """Probability ``[L, N]`` of a level after one step of the chain."""
+        weights = [row[level] for row in self._chain_rows]
+        terms = [planes[:, k] if w == 1 else planes[:, k] * w for k, w in enumerate(weights) if w > 0]
+        return sum(terms[1:], terms[0]) if terms else torch.zeros_like(planes[:, 0])
 
     def _degrade_planes(self, planes: Tensor) -> Tensor:
         """One step of the chain in every location: a pass over the planes for each nonzero diagonal."""
+        if torch.compiler.is_compiling():
+            return torch.stack([self._next_level(planes, level) for level in range(self.num_levels)], 1)
         result = planes * self._stay
         for source, target, probs in self._diagonals:
             result[:, target].addcmul_(planes[:, source], probs)
         return result
 
-    def _observe(self, planes: Tensor, location: Tensor, noise: Tensor, repaired: Tensor) -> None:
-        """Draw and set the level at every robot's location, in place; after a repair it is 0."""
-        uniforms = noise.reshape(-1, self.num_robots)
-        for robot in range(self.num_robots):
-            level = inverse_cdf(self._levels_at(planes, location[robot]), uniforms[:, robot], dim=0)
-            self._set_level(planes, location[robot], level.masked_fill(repaired[robot], 0))
+    def _set_levels(self, planes: Tensor, location: Tensor, levels: Tensor) -> Tensor:
+        """Make ``levels`` ``[R, N]`` certain at ``location`` ``[R, N]``, in place."""
+        for place, level in zip(location, levels, strict=True):
+            certain = torch.eq(self._levels, level).to(self.dtype)
+            planes.scatter_(0, place.expand(1, *planes.shape[1:]), certain.unsqueeze(0))
+        return planes
 
-    def _set_level(self, planes: Tensor, location: Tensor, level: Tensor) -> None:
-        """Make ``level`` ``[N]`` certain at ``location`` ``[N]``, in place."""
-        self._put(planes, location, torch.eq(self._levels, level).to(self.dtype))
-
-    def _levels_at(self, planes: Tensor, location: Tensor) -> Tensor:
-        """Marginal ``[K, N]`` of each row's ``location`` ``[N]``."""
-        return planes.gather(0, location.expand(1, *planes.shape[1:])).squeeze(0)
-
-    def _put(self, planes: Tensor, location: Tensor, levels: Tensor) -> None:
-        planes.scatter_(0, location.expand(1, *planes.shape[1:]), levels.unsqueeze(0))
+    def _levels_at(self, planes: Tensor, place: Tensor) -> Tensor:
+        """Marginal ``[K, N]`` of each row's location ``place`` ``[N]``."""
+        return planes.gather(0, place.expand(1, *planes.shape[1:])).squeeze(0)
 
     def _successor(self, y: TensorDictBase, planes: Tensor, location: Tensor) -> TensorDictBase:
         shape = y.batch_size

@@ -87,6 +87,7 @@ class TruncatedRollout(nn.Module):
         max_steps: int = 400,
         terminal_cost: TerminalCost | None = None,
         chunk_rows: int = 16384,
+        compile: bool = False,
     ) -> None:
         super().__init__()
         for name, value in (("max_steps", max_steps), ("chunk_rows", chunk_rows)):
@@ -97,6 +98,7 @@ class TruncatedRollout(nn.Module):
         # Features that nobody reads are not computed; a plain callable may read all of them.
         self._keys = tuple(getattr(base_policy, "in_keys", ())) or None
         powers = model.discount ** torch.arange(max_steps + 1, dtype=torch.float64)
+        self._transition = torch.compile(self._policy_and_step, dynamic=True) if compile else self._policy_and_step
         self.register_buffer("_discounts", powers.to(model.device, model.dtype), persistent=False)
 
     def forward(self, y: TensorDictBase, keys: Tensor) -> Tensor:
@@ -139,15 +141,20 @@ class TruncatedRollout(nn.Module):
     def _admit(self, y: TensorDictBase, keys: Tensor, first: int, last: int) -> _Live:
         """The trajectories number ``first`` to ``last``, at their start."""
         number = torch.arange(first, min(last, keys.numel()), device=keys.device)
-        start = self.model.with_features(y[first:last], self._keys)
-        return _Live(start, keys[first:last], number, torch.zeros_like(number))
+        start = self.model.with_features(y[first:last].clone(), self._keys)
+        return _Live(start, keys[first:last].clone(), number, torch.zeros_like(number))
 
     def _step(self, live: _Live, ended: Tensor, total: Tensor) -> _Live:
         """One step of all live trajectories; those that have ended add no cost."""
-        u = self.base_policy(live.y).get("action")
-        cost, y = self.model.advance(live.y, u, step_noise(live.keys, live.age, self.model.noise_dim))
-        total.index_add_(0, live.number, (cost * self._discounts[live.age]).masked_fill(ended, 0.0))
+        cost, y = self._transition(live.y, live.keys, live.age)
+        total.index_add_(0, live.number, cost.masked_fill(ended, 0.0))
         return live._replace(y=y, age=live.age + 1)
+
+    def _policy_and_step(self, y: TensorDictBase, keys: Tensor, age: Tensor) -> tuple[Tensor, TensorDictBase]:
+        """Discounted stage cost ``[N]`` and next feature states of rows that have made ``age`` ``[N]`` steps."""
+        u = self.base_policy(y).get("action")
+        cost, nxt = self.model.advance(y, u, step_noise(keys, age, self.model.noise_dim))
+        return cost * self._discounts[age], nxt
 
     def _ended(self, live: _Live) -> Tensor:
         return self.model.is_terminal(live.y) | (live.age == self.max_steps)
