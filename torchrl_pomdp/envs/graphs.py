@@ -157,20 +157,21 @@ def _check_positive(**sizes: int) -> None:
 
 
 def _distances(table: Tensor) -> Tensor:
-    """All-pairs shortest path lengths by breadth-first relaxation; raises on unreachable nodes."""
-    size = table.shape[0]
-    distances = torch.full((size, size), size, dtype=torch.int64).fill_diagonal_(0)
-    missing = (table < 0).unsqueeze(-1)
-    changed = table.shape[1] > 0
-    while changed:
-        via = (distances[table.clamp_min(0)] + 1).masked_fill(missing, size).amin(1)
-        changed = bool((via < distances).any())
-        distances = torch.minimum(distances, via)
-    unreachable = (distances >= size).nonzero()
-    if unreachable.numel():
-        origin, target = unreachable[0].tolist()
-        raise ValueError(f"location {target} is unreachable from location {origin}: the graph must be connected")
-    return distances
+    """All-pairs shortest path lengths by breadth-first search; raises on unreachable nodes."""
+    neighbours = [[node for node in row if node >= 0] for row in table.tolist()]
+    result = []
+    for origin in range(len(neighbours)):
+        distance = {origin: 0}
+        frontier = [origin]
+        while frontier:
+            reached = dict.fromkeys(n for node in frontier for n in neighbours[node] if n not in distance)
+            distance |= dict.fromkeys(reached, distance[frontier[0]] + 1)
+            frontier = list(reached)
+        unreachable = next((node for node in range(len(neighbours)) if node not in distance), None)
+        if unreachable is not None:
+            raise ValueError(f"location {unreachable} is unreachable from location {origin}: the graph must be connected")
+        result.append([distance[node] for node in range(len(neighbours))])
+    return torch.tensor(result, dtype=torch.int64)
 
 
 def _first_controls(table: Tensor, distances: Tensor) -> Tensor:

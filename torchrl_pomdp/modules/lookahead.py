@@ -49,6 +49,7 @@ class RolloutPolicy(TensorDictModuleBase):
         terminal_cost: :math:`\hat J`, see :class:`TruncatedRollout`.
         seed: seed of the simulations.
         chunk_rows: see :class:`TruncatedRollout`; on a CPU each of ``torch.get_num_threads()`` threads has such a chunk.
+        compile: see :class:`TruncatedRollout`.
 
     Raises:
         ValueError: if a number is not positive, or ``leaves`` or ``allocation`` is unknown; when called, if a state does
@@ -78,6 +79,7 @@ class RolloutPolicy(TensorDictModuleBase):
         terminal_cost: TerminalCost | None = None,
         seed: int = 0,
         chunk_rows: int = 16384,
+        compile: bool = False,
     ) -> None:
         super().__init__()
         if trajectories < 1:
@@ -88,7 +90,12 @@ class RolloutPolicy(TensorDictModuleBase):
         self.in_keys = list(model.state_keys)
         self.model = model
         self.cost_to_go = TruncatedRollout(
-            model, base_policy, max_steps=max_steps, terminal_cost=terminal_cost, chunk_rows=chunk_rows
+            model,
+            base_policy,
+            max_steps=max_steps,
+            terminal_cost=terminal_cost,
+            chunk_rows=chunk_rows,
+            compile=compile,
         )
         self.trajectories, self.leaves, self.allocation, self.seed = trajectories, leaves, allocation, seed
 
@@ -138,7 +145,7 @@ class RolloutPolicy(TensorDictModuleBase):
         return [first] + [min(_NEXT_ROUND, rest - i) for i in range(0, rest, _NEXT_ROUND)]
 
     def _trajectory_costs(self, core: TensorDictBase, state: Tensor, u: Tensor, members: Tensor, keys: Tensor) -> Tensor:
-        r""":math:`\hat g(y,u)+\alpha\tilde J` for P state-control pairs and the trajectories ``members`` ``[n]``: ``[n, P]``."""
+        r""":math:`\hat g(y,u)+\alpha\tilde J` of P state-control pairs for the trajectories ``members`` ``[n]``: ``[n, P]``."""
         model, pairs = self.model, take_rows(core, state)
         pair, trajectory, observation, weight = self._leaves(model.observation_probs(pairs, u), members, keys[state])
         successors = model.estimator(take_rows(pairs, pair), u[pair], observation)

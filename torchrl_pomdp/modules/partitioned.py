@@ -3,6 +3,7 @@ r"""The partitioned policy: N local policies that act as one (paper, Section V).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -55,6 +56,8 @@ class PartitionedPolicy(TensorDictModuleBase):
         written = [set(policy.out_keys) for policy in policies]
         self.out_keys = [key for key in policies[0].out_keys if all(key in keys for keys in written)]
 
+    # Which rows go where depends on the data, which a compiler cannot follow.
+    @torch.compiler.disable
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the entries that all local policies write, ``"action"`` among them."""
         part = tensordict.get("partition").reshape(-1)
@@ -79,8 +82,8 @@ class PartitionedPolicy(TensorDictModuleBase):
         ]
         split = len(self._others)
         outputs += self._decide(y, order[sum(counts[:split]) :], counts[split:])
-        joined = torch.cat(outputs, 0)
-        return TensorDict({key: torch.empty_like(leaf).index_copy(0, order, leaf) for key, leaf in joined.items()}, y.batch_size)
+        joined: Any = torch.cat(outputs, 0)
+        return joined[torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))]
 
     def _decide(self, y: TensorDictBase, rows: Tensor, counts: list[int]) -> list[TensorDictBase]:
         """Outputs of the networks at ``rows``, of which each network has the next ``counts``; features are made once."""

@@ -1,0 +1,171 @@
+"""The rollout engine: compiled and eager, small and large chunks, threads, long runs."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import pytest
+import torch
+from torch._inductor import config as inductor_config
+
+from torchrl_pomdp.envs import CalibratedStart, RepairModel, damage_chain, line, tiger
+from torchrl_pomdp.modules import (
+    GreedyRepair,
+    PartitionedPolicy,
+    PolicyNetwork,
+    RelativeEncoder,
+    RolloutPolicy,
+    TruncatedRollout,
+)
+from torchrl_pomdp.modules.lookahead import spread
+from torchrl_pomdp.modules.threads import map_threads
+
+
+def chain_model(size, drift=0.0, dtype=torch.float32):
+    return RepairModel(line(size), damage_chain((drift, 0.02, 0.03, 0.05)), (0, 0.1, 1, 10, 100), 0.99, dtype=dtype)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 16, 50, 1000])
+def test_results_are_the_same_for_any_chunk_size(linear20, rows):
+    keys = torch.arange(90)
+    y = linear20.start(keys)
+    for options in ({}, {"max_steps": 17, "terminal_cost": lambda y: y["belief"][..., 4].sum(-1)}):
+        whole = TruncatedRollout(linear20.model, GreedyRepair(linear20.model), **options)(y, keys)
+        small = TruncatedRollout(linear20.model, GreedyRepair(linear20.model), chunk_rows=rows, **options)(y, keys)
+        assert torch.equal(small, whole)
+
+
+def test_the_number_of_threads_changes_nothing(linear20):
+    y = linear20.start(torch.arange(30))
+    policy = RolloutPolicy(linear20.model, GreedyRepair(linear20.model), trajectories=4)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = policy.q_factors(y)
+        torch.set_num_threads(3)
+        three = policy.q_factors(y)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(one, three)
+
+
+def test_map_threads_passes_errors_on():
+    def fail(x):
+        raise ValueError(f"no {x}")
+
+    with pytest.raises(ValueError, match="no 1"):
+        map_threads(fail, [1, 2], threads=2)
+
+
+def test_labels_can_be_trained_on(linear20):
+    """Simulations run in inference mode; what they return must be ordinary tensors."""
+    q = RolloutPolicy(linear20.model, GreedyRepair(linear20.model), trajectories=2).q_factors(linear20.start(torch.arange(3)))
+    weight = torch.ones(3, requires_grad=True)
+    (q.nan_to_num(posinf=0.0) @ weight).sum().backward()
+    assert weight.grad is not None
+
+
+def test_compiled_and_eager_agree(linear20):
+    keys = torch.arange(300)
+    y = linear20.start(keys)
+    greedy = GreedyRepair(linear20.model)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="compile=True")
+        fast = TruncatedRollout(linear20.model, greedy, compile=True, chunk_rows=100)(y, keys)
+    torch.testing.assert_close(fast, TruncatedRollout(linear20.model, greedy)(y, keys), rtol=1e-5, atol=1e-3)
+
+
+def test_without_a_compiler_it_runs_as_it_is(line3):
+    keys = torch.arange(20)
+    y, greedy = line3.start(keys), GreedyRepair(line3.model)
+    with (
+        inductor_config.patch({"cpp.cxx": ("/no/such/compiler",), "force_disable_caches": True}),
+        pytest.warns(UserWarning, match="compile=True has no effect"),
+    ):
+        cost = TruncatedRollout(line3.model, greedy, compile=True)(y, keys)
+    assert torch.equal(cost, TruncatedRollout(line3.model, greedy)(y, keys))
+
+
+def test_float32_agrees_with_float64_over_long_runs_on_long_lines():
+    def sweep(y):
+        """Repair wherever that is allowed, else go right, at the end left."""
+        return y.set("action", torch.where(y["action_mask"][..., 0], 0, torch.where(y["action_mask"][..., 2], 2, 1)))
+
+    costs = []
+    for dtype in (torch.float32, torch.float64):
+        model = chain_model(500, dtype=dtype)
+        y = CalibratedStart(model)(torch.arange(64))
+        costs.append(TruncatedRollout(model, sweep, max_steps=400)(y, torch.arange(64)).double())
+    torch.testing.assert_close(costs[0], costs[1], rtol=1e-4, atol=0)
+
+
+def test_beliefs_stay_normalised(linear20):
+    model, greedy = chain_model(20, drift=0.01), GreedyRepair(chain_model(20, drift=0.01))
+    y = model.with_features(linear20.start(torch.arange(64)), ("belief", "location"))
+    for step in range(400):
+        _, y = model.advance(y, greedy(y.copy())["action"], torch.full((64, 1), (step * 0.618) % 1))
+    assert float((y["belief"].sum(-1) - 1).abs().max()) < 2e-5
+
+
+def test_the_router_equals_its_networks(linear20):
+    model = linear20.model
+    generator = torch.Generator().manual_seed(0)
+    encoder = RelativeEncoder(model)
+    networks = [PolicyNetwork(encoder, 3, (16,), generator=generator) for _ in range(6)]
+    y = model.with_features(torch.cat([training(torch.arange(40)) for training in linear20.training]))
+    mixed = [GreedyRepair(model), *networks[1:4], networks[4], networks[4]]
+    for policies in (networks, mixed):
+        routed = PartitionedPolicy(policies)(y.copy())
+        for part, policy in enumerate(policies):
+            rows = (y["partition"] == part).nonzero().squeeze(-1)
+            assert torch.equal(routed["action"][rows], policy(y[rows])["action"])
+
+
+def test_adaptive_allocation_settles_clear_decisions_and_agrees_with_uniform(linear20):
+    y = linear20.start(torch.arange(60))
+    steps = []
+
+    class Counting(GreedyRepair):
+        def forward(self, tensordict):
+            steps[-1] += tensordict.batch_size.numel()
+            return super().forward(tensordict)
+
+    q = []
+    for allocation in ("uniform", "adaptive"):
+        steps.append(0)
+        policy = RolloutPolicy(linear20.model, Counting(linear20.model), trajectories=40, allocation=allocation)
+        q.append(policy.q_factors(y))
+    assert steps[1] < 0.5 * steps[0]
+    assert torch.equal(torch.isfinite(q[0]), torch.isfinite(q[1]))
+    regret = q[0].gather(1, q[1].argmin(1, keepdim=True)).squeeze(1) - q[0].amin(1)
+    assert float(regret.mean()) < 0.01 * float(q[0].amin(1).mean())
+    few = RolloutPolicy(linear20.model, GreedyRepair(linear20.model), trajectories=1, allocation="adaptive").q_factors(y)
+    assert torch.equal(few, RolloutPolicy(linear20.model, GreedyRepair(linear20.model), trajectories=1).q_factors(y))
+
+
+def test_adaptive_labels_do_not_depend_on_the_batch(linear20):
+    y = linear20.start(torch.arange(40))
+    policy = RolloutPolicy(linear20.model, GreedyRepair(linear20.model), trajectories=8, allocation="adaptive")
+    assert torch.equal(torch.cat([policy.q_factors(part) for part in y.split(7)]), policy.q_factors(y))
+
+
+def test_adaptive_allocation_with_exact_first_observations():
+    y = {"belief": torch.tensor([[0.5, 0.5], [0.97, 0.03]])}
+    from tensordict import TensorDict
+
+    def listen(y):
+        return y.set("action", torch.zeros(y.batch_size, dtype=torch.int64))
+
+    policy = RolloutPolicy(tiger(), listen, trajectories=6, allocation="adaptive", leaves="observation", max_steps=30)
+    assert policy(TensorDict(y, [2]))["action"].tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 64])
+def test_spread_is_a_permutation_with_even_beginnings(count):
+    order = spread(count)
+    assert sorted(order.tolist()) == list(range(count))
+    for k in range(2, count + 1):
+        gaps = order[:k].sort().values.diff()
+        assert int(gaps.max()) <= 2 * math.ceil(count / k) + 1
