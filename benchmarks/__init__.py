@@ -1,0 +1,1 @@
+"""Measurements of the rollout engine: ``python -m benchmarks [NAME…]``."""

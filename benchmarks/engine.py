@@ -1,0 +1,164 @@
+"""Belief steps per second: against a scalar loop, against matrix products, over batch sizes and lengths of the line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.harness import Table, seconds, threads
+from benchmarks.setting import Counting, line_problem, linear20, network_flops, networks
+from torchrl_pomdp.envs import BeliefEnv
+from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout
+
+
+def greedy(table: Table) -> None:
+    """Greedy rollouts on one core, eager and compiled, against the numba loop."""
+    from benchmarks.numba_reference import greedy_rollout
+
+    model, start = linear20().model, linear20().start
+    keys = torch.arange(65_536)
+    y = start(keys)
+    rise = np.array([0, 0.02, 0.03, 0.05, 0], np.float32)
+    timed = []
+
+    def loop():
+        planes, places = y["belief"].transpose(1, 2).contiguous().numpy().copy(), y["location"][:, 0].numpy().copy()
+        begin = time.perf_counter()
+        result = greedy_rollout(
+            planes, places, keys.numpy().astype(np.uint64), rise, model.costs.numpy(), np.float32(0.99), 400, np.float32(1e-6)
+        )
+        timed.append(time.perf_counter() - begin)
+        return result
+
+    with threads(1):
+        loop()
+        costs, steps = loop()
+        loop()
+        reference = steps / sorted(timed[1:])[0]
+        table.add("numba loop, one core", reference / 1e6, "M steps/s")
+        for compile, target in ((False, ">= 0.20"), (True, ">= 0.40")):
+            rollout = TruncatedRollout(model, GreedyRepair(model), compile=compile)
+            error = np.abs(rollout(y, keys).numpy() - costs).max()
+            rate = steps / seconds(lambda rollout=rollout: rollout(y, keys))
+            name = "compiled" if compile else "eager"
+            table.add(f"greedy rollout, {name}", rate / 1e6, "M steps/s")
+            table.add(f"greedy rollout, {name}, over the numba loop", rate / reference, target=target)
+            table.add(f"greedy rollout, {name}: largest difference of a cost from the loop's", float(error), "cost")
+
+
+def batch(table: Table) -> None:
+    """Greedy steps per second on one core against the number of trajectories that are simulated at once."""
+    model, start = linear20().model, linear20().start
+    with threads(1):
+        for rows in (16, 64, 256, 1024, 4096, 16_384, 65_536):
+            keys = torch.arange(max(2 * rows, 2048) if rows >= 256 else 4 * rows)
+            y = start(keys)
+            policy = Counting(GreedyRepair(model))
+            rollout = TruncatedRollout(model, policy, chunk_rows=rows)
+            rollout(y, keys)
+            steps, policy.rows = policy.rows, 0
+            table.add(f"greedy steps with {rows} rows at once", steps / seconds(lambda: rollout(y, keys)) / 1e6, "M steps/s")
+
+
+def network(table: Table) -> None:
+    """Rollouts with the 256-64 networks: their matrix products against one large product on the same threads."""
+    model, start = linear20().model, linear20().start
+    keys = torch.arange(20_000)
+    y, policy = start(keys), Counting(networks())
+    with threads(1):
+        matrix = torch.rand(4096, 4096)
+        peak = 2 * 4096**3 / seconds(lambda: matrix @ matrix)
+        features = torch.rand(2730, networks().policies[0].encoder.num_features)
+        net = networks().policies[0].network
+        with torch.inference_mode():
+            alone = len(features) * network_flops() / seconds(lambda: net(features), 20)
+        table.add("large matrix product, one core", peak / 1e9, "GFlop/s")
+        table.add("the network by itself, 2730 rows, over the large product", alone / peak)
+        for compile, target in ((False, ">= 0.50"), (True, ">= 0.60")):
+            rollout = TruncatedRollout(model, policy, compile=compile)
+            rollout(y, keys)
+            policy.rows = 0
+            rollout(y, keys)
+            rate = policy.rows / seconds(lambda rollout=rollout: rollout(y, keys), 2)
+            name = "compiled" if compile else "eager"
+            table.add(f"network rollout, {name}", rate / 1e6, "M steps/s")
+            table.add(f"network rollout, {name}, products / all its time, over the large product", rate * network_flops() / peak,
+                      target=target)  # fmt: skip
+
+
+def router(table: Table) -> None:
+    """Six networks behind the router against one network on the same rows."""
+    problem = linear20()
+    for rows in (8192, 16_384):
+        y = problem.model.with_features(problem.start(torch.arange(rows // 2)))
+        y = torch.cat([y, *(problem.model.with_features(g(torch.arange(rows // 12 + 1))) for g in problem.training)])[:rows]
+        one, six = networks().policies[0], networks()
+        with threads(1), torch.inference_mode():
+            ratio = seconds(lambda y=y: six(y.copy()), 15) / seconds(lambda y=y: one(y.copy()), 15)
+        table.add(f"six-part router over one network, {rows} rows", ratio, target="<= 1.3")
+
+
+def locations(table: Table) -> None:
+    """Time of a greedy step against the number of locations, on one core."""
+    base = 0.0
+    with threads(1):
+        for size in (20, 50, 100, 200, 500):
+            model, start = line_problem(size)
+            keys = torch.arange(16_384 * 20 // size)
+            y = start(keys)
+            # The same number of bytes at once, whatever the size.
+            rollout = TruncatedRollout(model, GreedyRepair(model), max_steps=40, chunk_rows=len(keys))
+            policy = Counting(GreedyRepair(model))
+            TruncatedRollout(model, policy, max_steps=40, chunk_rows=len(keys))(y, keys)
+            step = seconds(lambda y=y, keys=keys, rollout=rollout: rollout(y, keys)) / policy.rows
+            table.add(f"greedy step, L = {size}", step * 1e9, "ns")
+            base = base or step
+            table.add(f"growth over linear from L = 20 to {size}", step / base / (size / 20), target="<= 1.2")
+
+
+_MEMORY = """
+import resource, sys, torch
+from benchmarks.setting import line_problem
+from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout
+torch.set_num_threads(1)
+rows, steps = int(sys.argv[1]), int(sys.argv[2])
+model, start = line_problem(20, drift=0.01)
+keys = torch.arange(rows)
+# Few different states, so that making them takes no memory to speak of.
+y = start(torch.arange(1024))[keys % 1024]
+TruncatedRollout(model, GreedyRepair(model), max_steps=2, chunk_rows=64)(y[:64], keys[:64])
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+TruncatedRollout(model, GreedyRepair(model), max_steps=steps, chunk_rows=rows)(y, keys)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
+"""
+
+
+def memory(table: Table) -> None:
+    """Peak memory of a rollout for each live row, in processes of their own; it must not grow with the length."""
+
+    def peak(rows: int, steps: int) -> int:
+        command = [sys.executable, "-c", _MEMORY, str(rows), str(steps)]
+        return int(subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[1]).stdout)
+
+    few, many = 131_072, 262_144
+    for steps in (20, 80):
+        per_row = (peak(many, steps) - peak(few, steps)) / (many - few)
+        table.add(f"memory for each live row, {steps} steps", per_row, "bytes", "<= 4096")
+
+
+def env_step(table: Table) -> None:
+    """``env.step`` on 16 384 rows against the bare model step with the same features."""
+    problem = linear20()
+    env = BeliefEnv(problem.model, problem.start, batch_size=(16_384,))
+    y = env.reset()
+    y = env.rand_action(y)
+    core = y.select(*env.observation_spec.keys())
+    noise = torch.rand(16_384, 1)
+    with threads(1):
+        bare = seconds(lambda: problem.model.advance(core, y["action"], noise), 31)
+        table.add("env.step over the bare model step, 16 384 rows", seconds(lambda: env.step(y), 31) / bare, target="<= 1.15")
