@@ -21,7 +21,7 @@ _LEAVES, _ALLOCATIONS = ("control", "observation"), ("uniform", "adaptive")
 # Leaves that are made at once, in chunks of the rollout: enough to keep its chunk full nearly all the time.
 _CHUNKS_PER_BLOCK = 4
 # Adaptive allocation: trajectories of the first and of every further round, and the standard errors that settle it.
-_FIRST_ROUND, _NEXT_ROUND, _CLEARLY = 3, 2, 2.0
+_FIRST_ROUND, _NEXT_ROUND, _CLEARLY = 3, 1, 2.2
 
 
 class RolloutPolicy(TensorDictModuleBase):
