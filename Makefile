@@ -1,5 +1,5 @@
 .DELETE_ON_ERROR:
-.PHONY: demo test lint tutorials
+.PHONY: demo test lint tutorials benchmarks
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -20,6 +20,9 @@ lint: .venv/installed
 tutorials: .venv/installed
 	$(BIN)/jupytext --to ipynb tutorials/*.py
 	$(BIN)/jupyter-execute --inplace tutorials/*.ipynb
+
+benchmarks: .venv/installed
+	$(BIN)/python -m benchmarks
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
