@@ -54,6 +54,8 @@ def _draw(results: dict) -> None:
             if name == "locations":
                 axes.loglog(x, [values[0] * size / x[0] for size in x], "--", color="#9aa5b1", label="linear")
                 axes.legend()
+            axes.set_xticks(x, [f"{size:,}" for size in x], rotation=30)
+            axes.minorticks_off()
             axes.grid(alpha=0.3)
             figure.savefig(FOLDER / f"{name}.png")
 

@@ -1,4 +1,4 @@
-"""What decisions cost: one of them, millions of labels, with fewer trajectories, with realised costs instead of expected ones."""
+"""What decisions cost: one, millions of labels, adaptive allocation, realised costs in place of expected ones."""
 
 from __future__ import annotations
 
