@@ -49,12 +49,24 @@ def test_relative_encoding_sees_the_same_from_everywhere():
 
 
 @pytest.mark.parametrize("encoder", [FlatEncoder, RelativeEncoder])
+@pytest.mark.parametrize("gradients", [False, True])
 @pytest.mark.parametrize("size", [1, 2, 5, 17, 100])
-def test_outputs_do_not_depend_on_the_batch(linear20, encoder, size):
+def test_outputs_do_not_depend_on_the_batch(linear20, encoder, size, gradients):
     policy = network(linear20.model, encoder=encoder)
     y = linear20.model.with_features(linear20.start(torch.arange(300)))
-    together, apart = policy(y.copy())["logits"], policy(y[100 : 100 + size].clone())["logits"]
+    with torch.set_grad_enabled(gradients):
+        together, apart = policy(y.copy())["logits"], policy(y[100 : 100 + size].clone())["logits"]
     assert torch.equal(apart, together[100 : 100 + size])
+
+
+@pytest.mark.parametrize(("graph", "robots"), [(line(6), 1), (grid(4, 3), 1), (line(5), 2), (grid(3, 2), 3)])
+def test_grouping_by_location_changes_no_output(graph, robots):
+    model = small_model(graph, num_robots=robots, dtype=torch.float32)
+    y = model.with_features(random_states(model, 200, 0))
+    policy = network(model, encoder=RelativeEncoder)
+    dense = policy(y.copy())["logits"].detach()
+    with torch.no_grad():
+        torch.testing.assert_close(policy(y.copy())["logits"], dense)
 
 
 def test_initial_weights_come_from_the_generator_alone(linear20):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -36,6 +37,23 @@ class Encoder(nn.Module):
     @abstractmethod
     def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
         """Features ``[M, F]`` of the rows ``rows`` (int64 ``[M]``, in that order; None: all) of a flat batch ``[N]``."""
+
+    def first_layers(
+        self, y: TensorDictBase, rows: Tensor, layers: Sequence[nn.Linear], counts: Sequence[int]
+    ) -> tuple[list[Tensor], Tensor]:
+        """Outputs of several networks' first layers, each at rows of its own.
+
+        Args:
+            y: feature states ``[N]``.
+            rows: int64 ``[M]``, numbers of rows of ``y``.
+            layers: the layers, each from ``num_features`` numbers.
+            counts: the first layer reads the first ``counts[0]`` of ``rows``, the second the next ``counts[1]``, ...
+
+        Returns:
+            each layer's output, and the rows ``[M]`` that they belong to: ``rows``, reordered within each layer's.
+        """
+        blocks = zip(layers, self.encode_rows(y, rows).split(list(counts)), strict=True)
+        return [_rowwise(layer, features) for layer, features in blocks], rows
 
 
 class FlatEncoder(Encoder):
@@ -80,7 +98,7 @@ class RelativeEncoder(Encoder):
     What to do with damage two steps to the left hardly depends on where on the pipeline the robot stands; with a window
     centred at the robot the network need not learn it anew for each location. An offset has K features: whether damage is
     possible at all and the probabilities of the damaged levels; offsets outside the graph are zero. The robot's location
-    follows, one-hot and filled with zeros to a multiple of K.
+    follows, one-hot.
 
     Args:
         model: the repair model; offsets are differences of its graph's columns and rows.
@@ -94,55 +112,87 @@ class RelativeEncoder(Encoder):
     """
 
     keys = ("belief", "location")
-    shared: Tensor
-    slots: Tensor
-    stride: Tensor
+    columns: Tensor
+    places: Tensor
 
     def __init__(self, model: RepairModel) -> None:
         super().__init__()
         self.num_levels, self.num_locations, self.num_robots = model.num_levels, model.num_locations, model.num_robots
-        # Slots are K numbers. First come those that all rows share: the outside and every place, one-hot; then a row's
-        # locations, one row after the other.
-        place_slots = -(-self.num_locations // self.num_levels)
-        shared = torch.zeros(1 + self.num_locations, place_slots * self.num_levels)
-        shared[1:, : self.num_locations] = torch.eye(self.num_locations)
-        shared = shared.view(-1, self.num_levels)[place_slots - 1 :]
-        window = _window(model.graph).T
-        own = window < self.num_locations
-        places = 1 + torch.arange(self.num_locations * place_slots).view(-1, place_slots)
-        slots = torch.cat([(window + len(shared)).masked_fill(~own, 0), places], -1)
-        tables = {
-            "shared": shared.to(model.dtype),
-            # [L, S]: the slots that a robot at a location reads in row 0, and by how much they move from row to row.
-            "slots": slots.to(torch.int32),
-            "stride": torch.cat([own * self.num_locations, torch.zeros_like(places)], -1).to(torch.int32),
-        }
-        for name, value in tables.items():
-            self.register_buffer(name, value.to(model.device), persistent=False)
-        self.num_features = self.num_robots * slots.shape[-1] * self.num_levels
+        size, levels = self.num_locations, self.num_levels
+        window = _window(model.graph)
+        # [L, L * K] for a robot at a location: which feature each number of the belief is; and the location's own.
+        columns = window.unsqueeze(-1) * levels + torch.arange(levels)
+        places = (int(window.max()) + 1) * levels + torch.arange(size)
+        self.register_buffer("columns", columns.flatten(1).to(model.device), persistent=False)
+        self.register_buffer("places", places.to(model.device), persistent=False)
+        # On a line the features are neighbours, which saves a copy; the first one then.
+        ranges = (columns.flatten(1).diff() == 1).all(-1).tolist()
+        self._neighbouring = [int(row[0]) if range else None for row, range in zip(columns.flatten(1), ranges, strict=True)]
+        self.robot_features = int(places[-1]) + 1
+        self.num_features = self.num_robots * self.robot_features
 
     def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
         """See :class:`Encoder`."""
-        table, location = self._table(y.get("belief")), y.get("location").T
-        rows = torch.arange(location.shape[-1], device=location.device) if rows is None else rows
-        blocks = []
-        for robot in location:
-            place = robot[rows]
-            slots = self.slots.index_select(0, place)
-            slots.addcmul_(self.stride.index_select(0, place), rows.unsqueeze(-1).to(torch.int32))
-            blocks.append(table.index_select(0, slots.flatten()).view(rows.numel(), -1))
-        return blocks[0] if len(blocks) == 1 else torch.cat(blocks, -1)
+        numbers, location = self._numbers(y.get("belief"), rows), y.get("location")
+        location = location if rows is None else location[rows]
+        features = numbers.new_zeros(len(numbers), self.num_robots, self.robot_features)
+        features.scatter_(-1, self.columns[location], numbers.unsqueeze(1).expand(-1, self.num_robots, -1))
+        features.scatter_(-1, self.places[location].unsqueeze(-1), 1.0)
+        return features.flatten(1)
 
-    def _table(self, belief: Tensor) -> Tensor:
-        """The shared slots, then those of every row of ``belief`` ``[N, L, K]``."""
-        size, first = belief.shape[0], len(self.shared)
-        table = belief.new_empty(first + size * self.num_locations, self.num_levels)
-        table[:first] = self.shared
+    def first_layers(
+        self, y: TensorDictBase, rows: Tensor, layers: Sequence[nn.Linear], counts: Sequence[int]
+    ) -> tuple[list[Tensor], Tensor]:
+        """See :class:`Encoder`. Without gradients, on a CPU, the rows are grouped by location.
+
+        Robots at one location see the same offsets, the others' features are zero: a group is multiplied by the few rows of
+        the weights that matter to it, and no window is ever made.
+        """
+        if torch.is_grad_enabled() or rows.device.type != "cpu":
+            return super().first_layers(y, rows, layers, counts)
+        numbers, location = self._numbers(y.get("belief"), None), y.get("location")
+        outputs, ordered = [], []
+        for layer, own in zip(layers, rows.split(list(counts)), strict=True):
+            order = location[own, 0].argsort(stable=True)
+            own = own[order]
+            output = self._first_layer(numbers, own, location[own, 0], layer, 0)
+            for robot in range(1, self.num_robots):
+                order = location[own, robot].argsort(stable=True)
+                others = self._first_layer(numbers, own[order], location[own[order], robot], layer, robot)
+                output.index_add_(0, order, others)
+            outputs.append(output)
+            ordered.append(own)
+        return outputs, torch.cat(ordered)
+
+    def _first_layer(self, numbers: Tensor, rows: Tensor, location: Tensor, layer: nn.Linear, robot: int) -> Tensor:
+        """A robot's share of ``layer`` at ``rows`` ``[M]`` of ``numbers`` ``[N, L * K]``, sorted by ``location`` ``[M]``."""
+        # Small groups are multiplied together with rows of the next ones, whose own products then replace the result.
+        x = numbers.index_select(0, nn.functional.pad(rows, (0, _MIN_ROWS)))
+        weight = layer.weight.T[robot * self.robot_features :][: self.robot_features].contiguous()
+        bias = weight[self.places] if robot else weight[self.places] + layer.bias
+        output = x.new_empty(len(x), layer.out_features)
+        start = 0
+        for place, count in enumerate(location.bincount(minlength=self.num_locations).tolist()):
+            if count:
+                block = slice(start, start + max(count, _MIN_ROWS))
+                torch.addmm(bias[place], x[block], self._seen_from(place, weight), out=output[block])
+                start += count
+        return output[:start]
+
+    def _seen_from(self, place: int, weight: Tensor) -> Tensor:
+        """Those rows of the weights ``[F, H]`` that the belief meets from a location: ``[L * K, H]``."""
+        first = self._neighbouring[place]
+        size = self.num_locations * self.num_levels
+        return weight.index_select(0, self.columns[place]) if first is None else weight.narrow(0, first, size)
+
+    def _numbers(self, belief: Tensor, rows: Tensor | None) -> Tensor:
+        """What the windows show of the rows of ``belief`` ``[N, L, K]``: ``[M, L * K]``."""
         # A transposition of two dimensions is much faster than a general permutation.
         planes = belief.permute(1, 2, 0).flatten(0, 1)
-        own = table[first:].view(size, -1).copy_(planes.T).view(belief.shape)
-        own[..., 0] = 1.0 - belief[..., 0].floor()
-        return table
+        numbers = planes.T.contiguous() if rows is None else planes.T.index_select(0, rows)
+        numbers = numbers.clone() if numbers.data_ptr() == belief.data_ptr() else numbers
+        numbers[:, :: self.num_levels] = 1.0 - numbers[:, :: self.num_levels].floor()
+        return numbers
 
 
 class PolicyNetwork(TensorDictModuleBase):
@@ -175,12 +225,36 @@ class PolicyNetwork(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"logits"`` ``[*B, U]`` (``-inf`` where illegal) and the most probable ``"action"`` ``[*B]``."""
-        logits = self.logits(self.encoder(tensordict), tensordict.get("action_mask"))
+        flat = tensordict.select(*self.in_keys).reshape(-1)
+        rows = torch.arange(flat.batch_size[0], device=flat.device)
+        output, rows = network_outputs([self], flat, rows, [rows.numel()])
+        logits = output[invert(rows)].view(*tensordict.batch_size, -1).masked_fill(~tensordict.get("action_mask"), -torch.inf)
         return tensordict.update({"logits": logits, "action": logits.argmax(-1)})
 
-    def logits(self, features: Tensor, action_mask: Tensor) -> Tensor:
-        """Logits ``[*B, U]`` from features ``[*B, F]``, ``-inf`` where ``action_mask`` ``[*B, U]`` is False."""
-        return _rowwise(self.network, features).masked_fill(~action_mask, -torch.inf)
+
+def network_outputs(
+    networks: Sequence[PolicyNetwork], y: TensorDictBase, rows: Tensor, counts: Sequence[int]
+) -> tuple[Tensor, Tensor]:
+    """Outputs of networks that share an encoder, each at rows of its own.
+
+    Args:
+        networks: the networks.
+        y: feature states ``[N]``.
+        rows: int64 ``[M]``, numbers of rows of ``y``.
+        counts: the first network is evaluated at the first ``counts[0]`` of ``rows``, the second at the next, ...
+
+    Returns:
+        outputs ``[M, .]`` and the rows ``[M]`` that they belong to: ``rows``, reordered within each network's.
+    """
+    first = [cast(nn.Linear, network.network[0]) for network in networks]
+    hidden, rows = networks[0].encoder.first_layers(y, rows, first, counts)
+    outputs = [_rowwise(network.network[1:], block) for network, block in zip(networks, hidden, strict=True)]
+    return torch.cat(outputs), rows
+
+
+def invert(order: Tensor) -> Tensor:
+    """The inverse of a permutation ``[M]``."""
+    return torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
 
 
 def _relu_network(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequential:
@@ -199,14 +273,12 @@ def _rowwise(network: nn.Module, features: Tensor) -> Tensor:
     flat = features.reshape(-1, features.shape[-1])
     missing = max(0, _MIN_ROWS - flat.shape[0])
     output = network(nn.functional.pad(flat, (0, 0, 0, missing)) if missing else flat)
-    return output[: flat.shape[0]].reshape(*features.shape[:-1], -1)
+    return output[: flat.shape[0]].reshape(*features.shape[:-1], output.shape[-1])
 
 
 def _window(graph: Graph) -> Tensor:
-    """Location at every offset from every location, ``[W, L]``; L where the offset leaves the graph."""
-    places = [(round(c), round(r)) for c, r in zip(graph.columns.tolist(), graph.rows.tolist(), strict=True)]
-    at = {place: index for index, place in enumerate(places)}
-    spans = [max(values) - min(values) for values in zip(*places, strict=True)]
-    offsets = [(dc, dr) for dr in range(-spans[1], spans[1] + 1) for dc in range(-spans[0], spans[0] + 1)]
-    outside = graph.num_locations
-    return torch.tensor([[at.get((c + dc, r + dr), outside) for c, r in places] for dc, dr in offsets])
+    """Number of the offset from every location to every location, ``[L, L]``: row by row, as a window centred at the first."""
+    column, row = graph.columns.round().to(torch.int64), graph.rows.round().to(torch.int64)
+    across, down = column - column.unsqueeze(-1), row - row.unsqueeze(-1)
+    width = int(across.max() - across.min()) + 1
+    return (down - down.min()) * width + across - across.min()

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_pomdp.envs.belief import take_rows
-from torchrl_pomdp.modules.networks import PolicyNetwork
+from torchrl_pomdp.modules.networks import PolicyNetwork, invert, network_outputs
 
 __all__ = ["PartitionedPolicy"]
 
@@ -74,23 +74,26 @@ class PartitionedPolicy(TensorDictModuleBase):
         """Outputs of the policies number ``chosen`` ``[N]`` at the rows of ``y`` ``[N]``."""
         order = chosen.argsort(stable=True)
         counts = chosen.bincount(minlength=len(self._others) + len(self._networks)).tolist()
-        rows = order.split(counts)
         outputs = [
             policy(take_rows(y, index)).select(*self.out_keys)
-            for policy, index in zip(self._others, rows, strict=False)
+            for policy, index in zip(self._others, order.split(counts), strict=False)
             if index.numel()
         ]
-        split = len(self._others)
-        outputs += self._decide(y, order[sum(counts[:split]) :], counts[split:])
+        networks = [
+            (network, count) for network, count in zip(self._networks, counts[len(self._others) :], strict=True) if count
+        ]
+        if networks:
+            rest = order.numel() - sum(count for _, count in networks)
+            decisions, rows = self._decide(y, order[rest:], *zip(*networks, strict=True))
+            order = torch.cat([order[:rest], rows])
+            outputs.append(decisions)
         joined: Any = torch.cat(outputs, 0)
-        return joined[torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))]
+        return joined[invert(order)]
 
-    def _decide(self, y: TensorDictBase, rows: Tensor, counts: list[int]) -> list[TensorDictBase]:
-        """Outputs of the networks at ``rows``, of which each network has the next ``counts``; features are made once."""
-        if self._encoder is None or rows.numel() == 0:
-            return []
-        features = self._encoder.encode_rows(y, None if len(counts) == 1 and not self._others else rows).split(counts)
-        masks = y.get("action_mask").index_select(0, rows).split(counts)
-        blocks = zip(self._networks, features, masks, strict=True)
-        logits = torch.cat([network.logits(x, mask) for network, x, mask in blocks if len(x)])
-        return [TensorDict({"logits": logits, "action": logits.argmax(-1)}, rows.shape).select(*self.out_keys)]
+    def _decide(
+        self, y: TensorDictBase, rows: Tensor, networks: Sequence[PolicyNetwork], counts: Sequence[int]
+    ) -> tuple[TensorDictBase, Tensor]:
+        """Outputs of the networks at ``rows``, of which each has the next ``counts``, and the rows in the outputs' order."""
+        logits, rows = network_outputs(networks, y, rows, counts)
+        logits = logits.masked_fill(~y.get("action_mask").index_select(0, rows), -torch.inf)
+        return TensorDict({"logits": logits, "action": logits.argmax(-1)}, rows.shape).select(*self.out_keys), rows
