@@ -9,7 +9,7 @@ import torch
 
 from torchrl_pomdp.envs.belief import StateGenerator
 from torchrl_pomdp.envs.generators import CalibratedStart, InPart, RandomState, UniformStart
-from torchrl_pomdp.envs.graphs import Graph, line
+from torchrl_pomdp.envs.graphs import Graph, grid, line
 from torchrl_pomdp.envs.partition import RepairPartition
 from torchrl_pomdp.envs.repair import RepairModel, damage_chain
 
@@ -56,10 +56,12 @@ def make_problem(name: str, *, device: torch.device | str = "cpu") -> Problem:
     return PRESETS[name](name, torch.device(device))
 
 
-def _repair_model(graph: Graph, device: torch.device) -> RepairModel:
+def _repair_model(graph: Graph, num_robots: int, device: torch.device) -> RepairModel:
     costs = torch.tensor(COSTS)
     partition = RepairPartition(graph, costs, device=device)
-    return RepairModel(graph, damage_chain(DEGRADATION), costs, DISCOUNT, partition=partition, device=device)
+    return RepairModel(
+        graph, damage_chain(DEGRADATION), costs, DISCOUNT, num_robots=num_robots, partition=partition, device=device
+    )
 
 
 def _training(model: RepairModel) -> tuple[StateGenerator, ...]:
@@ -69,15 +71,21 @@ def _training(model: RepairModel) -> tuple[StateGenerator, ...]:
     return tuple(InPart(model, startgame if part < 3 else endgame, part) for part in parts)
 
 
-def _linear20(name: str, device: torch.device) -> Problem:
-    model = _repair_model(line(20), device)
+def _repair_problem(name: str, graph: Graph, num_robots: int, device: torch.device) -> Problem:
+    model = _repair_model(graph, num_robots, device)
     return Problem(name, model, CalibratedStart(model), _training(model))
 
 
 def _line3(name: str, device: torch.device) -> Problem:
-    model = _repair_model(line(3), device)
+    model = _repair_model(line(3), 1, device)
     return Problem(name, model, UniformStart(model), _training(model))
 
 
-PRESETS: dict[str, Callable[[str, torch.device], Problem]] = {"line3": _line3, "linear20": _linear20}
+PRESETS: dict[str, Callable[[str, torch.device], Problem]] = {
+    "line3": _line3,
+    "linear20": lambda name, device: _repair_problem(name, line(20), 1, device),
+    "grid5x4": lambda name, device: _repair_problem(name, grid(5, 4), 1, device),
+    "grid6x6": lambda name, device: _repair_problem(name, grid(6, 6), 1, device),
+    "two_robots20": lambda name, device: _repair_problem(name, line(20), 2, device),
+}
 """Builders of the known problems, by name."""

@@ -1,6 +1,6 @@
 """Policies, rollout, lookahead and partitioned networks (paper, Sections III to VI)."""
 
-from torchrl_pomdp.modules.base_policies import GreedyRepair
+from torchrl_pomdp.modules.base_policies import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.modules.lookahead import RolloutPolicy
 from torchrl_pomdp.modules.networks import Encoder, FlatEncoder, PolicyNetwork, RelativeEncoder
 from torchrl_pomdp.modules.partitioned import PartitionedPolicy
@@ -17,4 +17,5 @@ __all__ = [
     "RolloutPolicy",
     "TerminalCost",
     "TruncatedRollout",
+    "UrgencyRepair",
 ]

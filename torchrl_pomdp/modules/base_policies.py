@@ -7,9 +7,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_pomdp.envs.partition import location_costs
 from torchrl_pomdp.envs.repair import REPAIR, RepairModel
 
-__all__ = ["GreedyRepair"]
+__all__ = ["GreedyRepair", "UrgencyRepair"]
 
 
 class GreedyRepair(TensorDictModuleBase):
@@ -48,10 +49,7 @@ class GreedyRepair(TensorDictModuleBase):
         # [L, L], target by origin: orders targets by distance, then index, and is below `size * size` for all.
         ranks = model.graph.distances.T * size + torch.arange(size).unsqueeze(-1)
         self.register_buffer("ranks", ranks.to(model.device, model.dtype), persistent=False)
-        # [L]: the lowest move of a robot, or repair where it cannot move.
-        legal = model.destinations >= 0
-        legal[:, REPAIR] = ~legal[:, 1:].any(-1)
-        self.register_buffer("first_moves", legal.to(torch.int64).argmax(-1), persistent=False)
+        self.register_buffer("first_moves", _first_moves(model), persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``."""
@@ -73,3 +71,63 @@ class GreedyRepair(TensorDictModuleBase):
         target = (rank - (rank / size).floor() * size).to(torch.int64)
         control = self.model.first_controls.flatten()[location * size + target]
         return torch.where(nowhere, self.first_moves[location], control)
+
+
+class UrgencyRepair(TensorDictModuleBase):
+    r"""Go where damage costs most for the way there, and repair: the location that maximises :math:`(b\cdot c)/(d+1)^3`.
+
+    :math:`b\cdot c` is the expected cost of a location per stage, d the number of moves to it. Ties go to the location,
+    then to the control, with the lower index. Robots choose one after the other, each among the locations that no earlier
+    robot has chosen. A robot for which no costly location is left takes its first move.
+
+    Args:
+        model: the repair model.
+        exponent: how much the distance counts, not negative.
+
+    Raises:
+        ValueError: if ``exponent`` is negative.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> problem = make_problem("linear20")
+        >>> UrgencyRepair(problem.model)(problem.start(torch.arange(5)))["action"].shape
+        torch.Size([5])
+    """
+
+    in_keys = ["belief", "location"]
+    out_keys = ["action"]
+    nearness: Tensor
+    first_moves: Tensor
+
+    def __init__(self, model: RepairModel, exponent: float = 3.0) -> None:
+        super().__init__()
+        if not exponent >= 0.0:
+            raise ValueError(f"exponent must not be negative, got {exponent}")
+        self.model, self.exponent = model, exponent
+        self._prices = tuple(model.costs.tolist())
+        # [L, L], target by origin.
+        nearness = (model.graph.distances.T + 1.0) ** -exponent
+        self.register_buffer("nearness", nearness.to(model.device, model.dtype), persistent=False)
+        self.register_buffer("first_moves", _first_moves(model), persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"action"``, int64 ``[*B]``."""
+        model = self.model
+        belief = tensordict.get("belief").reshape(-1, model.num_locations, model.num_levels)
+        location = tensordict.get("location").reshape(-1, model.num_robots)
+        costs = location_costs(belief.permute(1, 2, 0), self._prices)
+        controls = []
+        for robot in range(model.num_robots):
+            urgency, target = (costs * self.nearness[:, location[:, robot]]).max(0)
+            control = model.first_controls[location[:, robot], target]
+            controls.append(torch.where(urgency > 0, control, self.first_moves[location[:, robot]]))
+            if robot + 1 < model.num_robots:
+                costs = costs.scatter(0, target.unsqueeze(0), 0.0)
+        return tensordict.set("action", model.join_controls(torch.stack(controls, -1)).view(tensordict.batch_size))
+
+
+def _first_moves(model: RepairModel) -> Tensor:
+    """The lowest move of a robot at every location ``[L]``, or repair where it cannot move."""
+    legal = model.destinations >= 0
+    legal[:, REPAIR] = ~legal[:, 1:].any(-1)
+    return legal.to(torch.int64).argmax(-1)

@@ -35,6 +35,9 @@ class PolicyIterationConfig:
     leaves: Literal["control", "observation"] = "control"
     """What a leaf is: a control, its first observations stratified, or a pair of control and first observation."""
 
+    allocation: Literal["uniform", "adaptive"] = "uniform"
+    """Whether every control gets all trajectories, or the clearly beaten ones no more of them."""
+
     max_steps: int = 400
     """Stages after which a simulated trajectory is cut."""
 

@@ -162,6 +162,7 @@ class PolicyIteration:
             RolloutPolicy,
             trajectories=config.trajectories,
             leaves=config.leaves,
+            allocation=config.allocation,
             max_steps=config.max_steps,
             seed=self._seed(iteration, "labels", number),
         )

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_pomdp.envs import PRESETS, make_problem
+
+# States, controls, observations and the model's own description of them.
+SIZES = {
+    "line3": (3 * 5**3, 3, 5, "line of 3, 1 robot: 3.8e+02 states"),
+    "linear20": (20 * 5**20, 3, 5, "line of 20, 1 robot: 1.9e+15 states"),
+    "grid5x4": (20 * 5**20, 5, 5, "5 x 4 grid, 1 robot: 1.9e+15 states"),
+    "grid6x6": (36 * 5**36, 5, 5, "6 x 6 grid, 1 robot: 5.2e+26 states"),
+    "two_robots20": (20**2 * 5**20, 9, 25, "line of 20, 2 robots: 3.8e+16 states"),
+}
+
+
+def test_the_sizes_of_all_presets():
+    assert set(PRESETS) == set(SIZES)
+    for name, (states, controls, observations, text) in SIZES.items():
+        model = make_problem(name).model
+        assert (model.num_states, model.num_controls, model.num_observations) == (states, controls, observations)
+        assert model.describe().startswith(text)
+
+
+@pytest.mark.parametrize("name", sorted(SIZES))
+def test_training_states_lie_in_their_parts_and_starts_are_startgame(name):
+    problem = make_problem(name)
+    for part, generator in enumerate(problem.training):
+        y = problem.model.with_features(generator(torch.arange(40)))
+        problem.model.check_state(y)
+        assert (y["partition"] == part).all()
+    assert (problem.model.partition(problem.start(torch.arange(200))) < 3).all()
+
+
+def test_unknown_presets_are_refused():
+    with pytest.raises(ValueError, match="unknown preset 'line4'; known presets: grid5x4"):
+        make_problem("line4")

@@ -1,0 +1,67 @@
+"""Base policies against their definitions, row by row, and against an independent simulation."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from _oracles import random_states, small_model
+
+from torchrl_pomdp.envs import REPAIR, Graph, grid, line, make_problem
+from torchrl_pomdp.evaluation import compare, discounted_costs
+from torchrl_pomdp.modules import GreedyRepair, UrgencyRepair
+
+
+def urgency_by_hand(model, belief, places):
+    """Robots' controls for one state, from the definition."""
+    costs = [sum(float(p) * float(c) for p, c in zip(row, model.costs, strict=True)) for row in belief]
+    controls = []
+    for place in places:
+        distances = model.graph.distances[place].tolist()
+        urgency = [cost / (distance + 1) ** 3 for cost, distance in zip(costs, distances, strict=True)]
+        target = max(range(len(urgency)), key=lambda i: (urgency[i], -i))
+        if urgency[target] == 0:
+            controls.append(next(1 + s for s, node in enumerate(model.graph.neighbours[place].tolist()) if node >= 0))
+            continue
+        costs[target] = 0.0
+        step = [
+            1 + s
+            for s, node in enumerate(model.graph.neighbours[place].tolist())
+            if node >= 0 and model.graph.distances[node, target] == distances[target] - 1
+        ]
+        controls.append(REPAIR if target == place else step[0])
+    return controls
+
+
+@pytest.mark.parametrize(
+    ("graph", "robots"), [(line(7), 1), (grid(4, 3), 1), (line(6), 2), (Graph.from_edges("y", 4, [(0, 1), (1, 2), (1, 3)]), 3)]
+)
+def test_urgency_is_its_definition(graph, robots):
+    model = small_model(graph, num_robots=robots)
+    y = model.with_features(random_states(model, 150, 0))
+    u = UrgencyRepair(model)(y.copy())["action"]
+    assert y["action_mask"].gather(1, u.unsqueeze(1)).all(), "urgency is always legal"
+    for row in range(150):
+        expected = urgency_by_hand(model, y["belief"][row], y["location"][row].tolist())
+        assert model.split_controls(u)[row].tolist() == expected
+
+
+def test_robots_that_stand_together_go_to_different_places():
+    model = small_model(line(5), num_robots=2)
+    belief = torch.eye(3, dtype=model.dtype)[torch.tensor([1, 0, 0, 0, 1])].unsqueeze(0)
+    y = model.with_features(random_states(model, 1, 0).set("belief", belief).set("location", torch.tensor([[2, 2]])))
+    left, right = 1, 2
+    assert model.split_controls(UrgencyRepair(model)(y)["action"]).tolist() == [[left, right]]
+
+
+@pytest.mark.parametrize(("name", "ratio"), [("linear20", 0.945), ("grid5x4", 0.84), ("grid6x6", 0.91)])
+def test_urgency_against_greedy_as_independently_simulated(name, ratio):
+    problem = make_problem(name)
+    policies = UrgencyRepair(problem.model), GreedyRepair(problem.model)
+    costs = [discounted_costs(problem.model, policy, problem.start, num_states=1000) for policy in policies]
+    found = compare(*costs).ratio
+    assert abs(found.mean - ratio) < 3 * found.standard_error + 0.005
+
+
+def test_a_negative_exponent_is_refused(line3):
+    with pytest.raises(ValueError, match="exponent must not be negative, got -1"):
+        UrgencyRepair(line3.model, -1)
