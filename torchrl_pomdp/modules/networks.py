@@ -1,202 +1,58 @@
-r"""Encoders of the feature state and the policy network :math:`\hat\mu(y,r)` (paper, Sections IV and VI-C)."""
+r"""Policy and value networks, :math:`\hat\mu(y,r)` and :math:`\hat J(y,r)` (paper, Sections IV and VI-C)."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import Categorical
 
-from torchrl_pomdp.envs.belief import BeliefModel
-from torchrl_pomdp.envs.graphs import Graph
-from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.envs.belief import take_rows
+from torchrl_pomdp.modules.encoders import Encoder, rowwise
 
-__all__ = ["Encoder", "FlatEncoder", "PolicyNetwork", "RelativeEncoder"]
-
-# BLAS multiplies a handful of rows by another kernel, which rounds differently: with at least this many rows the
-# output of a row does not depend on the batch it is in.
-_MIN_ROWS = 16
+__all__ = ["LocalNetwork", "PolicyNetwork", "ValueNetwork", "evaluate_networks", "invert"]
 
 
-class Encoder(nn.Module):
-    """Maps feature states ``[*B]`` to vectors ``[*B, num_features]``, reading the entries ``keys``."""
+class LocalNetwork(TensorDictModuleBase):
+    """A ReLU network over an encoded feature state; base of policy and value networks.
 
-    keys: tuple[str, ...]
-    num_features: int
+    Args:
+        encoder: encoder of feature states.
+        sizes: sizes of the hidden layers and of the output.
+        generator: generator of the initial weights; the global one is left alone.
 
-    def forward(self, y: TensorDictBase) -> Tensor:
-        """Features ``[*B, F]`` of feature states ``[*B]``."""
-        return self.encode_rows(y.reshape(-1), None).reshape(*y.batch_size, self.num_features)
+    Attributes:
+        entry_keys: what :meth:`entries` reads of a feature state.
+    """
+
+    entry_keys: Sequence[str]
+
+    def __init__(self, encoder: Encoder, sizes: Sequence[int], generator: torch.Generator) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.network = _relu_network([encoder.num_features, *sizes], generator)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the ``out_keys`` for feature states ``[*B]``."""
+        flat = tensordict.select(*self.in_keys).reshape(-1)
+        rows = torch.arange(flat.batch_size[0], device=flat.device)
+        entries, rows = evaluate_networks([self], flat, rows, [rows.numel()])
+        return tensordict.update(entries[invert(rows)].reshape(tensordict.batch_size))
 
     @abstractmethod
-    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
-        """Features ``[M, F]`` of the rows ``rows`` (int64 ``[M]``, in that order; None: all) of a flat batch ``[N]``."""
-
-    def first_layers(
-        self, y: TensorDictBase, rows: Tensor, layers: Sequence[nn.Linear], counts: Sequence[int]
-    ) -> tuple[list[Tensor], Tensor]:
-        """Outputs of several networks' first layers, each at rows of its own.
-
-        Args:
-            y: feature states ``[N]``.
-            rows: int64 ``[M]``, numbers of rows of ``y``.
-            layers: the layers, each from ``num_features`` numbers.
-            counts: the first layer reads the first ``counts[0]`` of ``rows``, the second the next ``counts[1]``, ...
-
-        Returns:
-            each layer's output, and the rows ``[M]`` that they belong to: ``rows``, reordered within each layer's.
-        """
-        blocks = zip(layers, self.encode_rows(y, rows).split(list(counts)), strict=True)
-        return [_rowwise(layer, features) for layer, features in blocks], rows
+    def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
+        """What the outputs ``[M, .]`` of the last layer mean at feature states ``y`` ``[M]``."""
 
 
-class FlatEncoder(Encoder):
-    """The paper's encoding, for any model: real entries flattened, integer entries one-hot.
+class PolicyNetwork(LocalNetwork):
+    r"""Masked policy network :math:`\hat\mu(y,r)`, 256-64 in the paper; writes ``"logits"`` and ``"action"``.
 
-    Args:
-        model: the belief model.
-
-    Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> problem = make_problem("linear20")
-        >>> encoder = FlatEncoder(problem.model)
-        >>> encoder.num_features, encoder(problem.start(torch.arange(6))).shape
-        (120, torch.Size([6, 120]))
-    """
-
-    def __init__(self, model: BeliefModel) -> None:
-        super().__init__()
-        spec = model.state_spec()
-        self.keys = model.state_keys
-        self.classes = {key: leaf.n if isinstance(leaf, Categorical) else None for key, leaf in spec.items()}
-        self.num_features = sum(leaf.shape.numel() * (self.classes[key] or 1) for key, leaf in spec.items())
-        self.dtype = model.dtype
-
-    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
-        """See :class:`Encoder`."""
-        blocks = []
-        for key in self.keys:
-            # [., N] and its transpose: entries kept as planes are turned by one fast transposition.
-            leaf = y.get(key).movedim(0, -1).flatten(0, -2)
-            classes = self.classes[key]
-            if classes is not None:
-                leaf = (leaf.unsqueeze(1) == torch.arange(classes, device=leaf.device).unsqueeze(-1)).flatten(0, 1)
-            blocks.append(leaf.to(self.dtype))
-        features = torch.cat(blocks).T.contiguous()
-        return features if rows is None else features.index_select(0, rows)
-
-
-class RelativeEncoder(Encoder):
-    """The repair problem as each robot sees it: what is known of the location at every offset from the robot.
-
-    What to do with damage two steps to the left hardly depends on where on the pipeline the robot stands; with a window
-    centred at the robot the network need not learn it anew for each location. An offset has K features: whether damage is
-    possible at all and the probabilities of the damaged levels; offsets outside the graph are zero. The robot's location
-    follows, one-hot.
-
-    Args:
-        model: the repair model; offsets are differences of its graph's columns and rows.
-
-    Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> problem = make_problem("linear20")
-        >>> encoder = RelativeEncoder(problem.model)
-        >>> encoder.num_features == 39 * 5 + 20, encoder(problem.start(torch.arange(6))).shape
-        (True, torch.Size([6, 215]))
-    """
-
-    keys = ("belief", "location")
-    columns: Tensor
-    places: Tensor
-
-    def __init__(self, model: RepairModel) -> None:
-        super().__init__()
-        self.num_levels, self.num_locations, self.num_robots = model.num_levels, model.num_locations, model.num_robots
-        size, levels = self.num_locations, self.num_levels
-        window = _window(model.graph)
-        # [L, L * K] for a robot at a location: which feature each number of the belief is; and the location's own.
-        columns = window.unsqueeze(-1) * levels + torch.arange(levels)
-        places = (int(window.max()) + 1) * levels + torch.arange(size)
-        self.register_buffer("columns", columns.flatten(1).to(model.device), persistent=False)
-        self.register_buffer("places", places.to(model.device), persistent=False)
-        # On a line the features are neighbours, which saves a copy; the first one then.
-        ranges = (columns.flatten(1).diff() == 1).all(-1).tolist()
-        self._neighbouring = [int(row[0]) if range else None for row, range in zip(columns.flatten(1), ranges, strict=True)]
-        self.robot_features = int(places[-1]) + 1
-        self.num_features = self.num_robots * self.robot_features
-
-    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
-        """See :class:`Encoder`."""
-        numbers, location = self._numbers(y.get("belief"), rows), y.get("location")
-        location = location if rows is None else location[rows]
-        features = numbers.new_zeros(len(numbers), self.num_robots, self.robot_features)
-        features.scatter_(-1, self.columns[location], numbers.unsqueeze(1).expand(-1, self.num_robots, -1))
-        features.scatter_(-1, self.places[location].unsqueeze(-1), 1.0)
-        return features.flatten(1)
-
-    def first_layers(
-        self, y: TensorDictBase, rows: Tensor, layers: Sequence[nn.Linear], counts: Sequence[int]
-    ) -> tuple[list[Tensor], Tensor]:
-        """See :class:`Encoder`. Without gradients, on a CPU, the rows are grouped by location.
-
-        Robots at one location see the same offsets, the others' features are zero: a group is multiplied by the few rows of
-        the weights that matter to it, and no window is ever made.
-        """
-        if torch.is_grad_enabled() or rows.device.type != "cpu":
-            return super().first_layers(y, rows, layers, counts)
-        numbers, location = self._numbers(y.get("belief"), None), y.get("location")
-        outputs, ordered = [], []
-        for layer, own in zip(layers, rows.split(list(counts)), strict=True):
-            order = location[own, 0].argsort(stable=True)
-            own = own[order]
-            output = self._first_layer(numbers, own, location[own, 0], layer, 0)
-            for robot in range(1, self.num_robots):
-                order = location[own, robot].argsort(stable=True)
-                others = self._first_layer(numbers, own[order], location[own[order], robot], layer, robot)
-                output.index_add_(0, order, others)
-            outputs.append(output)
-            ordered.append(own)
-        return outputs, torch.cat(ordered)
-
-    def _first_layer(self, numbers: Tensor, rows: Tensor, location: Tensor, layer: nn.Linear, robot: int) -> Tensor:
-        """A robot's share of ``layer`` at ``rows`` ``[M]`` of ``numbers`` ``[N, L * K]``, sorted by ``location`` ``[M]``."""
-        # Small groups are multiplied together with rows of the next ones, whose own products then replace the result.
-        x = numbers.index_select(0, nn.functional.pad(rows, (0, _MIN_ROWS)))
-        weight = layer.weight.T[robot * self.robot_features :][: self.robot_features].contiguous()
-        bias = weight[self.places] if robot else weight[self.places] + layer.bias
-        output = x.new_empty(len(x), layer.out_features)
-        start = 0
-        for place, count in enumerate(location.bincount(minlength=self.num_locations).tolist()):
-            if count:
-                block = slice(start, start + max(count, _MIN_ROWS))
-                torch.addmm(bias[place], x[block], self._seen_from(place, weight), out=output[block])
-                start += count
-        return output[:start]
-
-    def _seen_from(self, place: int, weight: Tensor) -> Tensor:
-        """Those rows of the weights ``[F, H]`` that the belief meets from a location: ``[L * K, H]``."""
-        first = self._neighbouring[place]
-        size = self.num_locations * self.num_levels
-        return weight.index_select(0, self.columns[place]) if first is None else weight.narrow(0, first, size)
-
-    def _numbers(self, belief: Tensor, rows: Tensor | None) -> Tensor:
-        """What the windows show of the rows of ``belief`` ``[N, L, K]``: ``[M, L * K]``."""
-        # A transposition of two dimensions is much faster than a general permutation.
-        planes = belief.permute(1, 2, 0).flatten(0, 1)
-        numbers = planes.T.contiguous() if rows is None else planes.T.index_select(0, rows)
-        numbers = numbers.clone() if numbers.data_ptr() == belief.data_ptr() else numbers
-        numbers[:, :: self.num_levels] = 1.0 - numbers[:, :: self.num_levels].floor()
-        return numbers
-
-
-class PolicyNetwork(TensorDictModuleBase):
-    r"""Masked policy network :math:`\hat\mu(y,r)`: a ReLU network over the encoded feature state, 256-64 in the paper.
+    Logits ``[*B, U]`` are ``-inf`` where a control is illegal; the action int64 ``[*B]`` is the most probable one.
 
     Args:
         encoder: encoder of feature states.
@@ -206,6 +62,7 @@ class PolicyNetwork(TensorDictModuleBase):
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import FlatEncoder
         >>> problem = make_problem("linear20")
         >>> network = PolicyNetwork(FlatEncoder(problem.model), 3, generator=torch.Generator().manual_seed(0))
         >>> y = network(problem.model.with_features(problem.start(torch.arange(6))))
@@ -218,24 +75,61 @@ class PolicyNetwork(TensorDictModuleBase):
     def __init__(
         self, encoder: Encoder, num_controls: int, hidden: Sequence[int] = (256, 64), *, generator: torch.Generator
     ) -> None:
-        super().__init__()
-        self.encoder = encoder
-        self.in_keys = [*encoder.keys, "action_mask"]
-        self.network = _relu_network([encoder.num_features, *hidden, num_controls], generator)
+        super().__init__(encoder, [*hidden, num_controls], generator)
+        self.entry_keys = ["action_mask"]
+        self.in_keys = [*encoder.keys, *self.entry_keys]
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``"logits"`` ``[*B, U]`` (``-inf`` where illegal) and the most probable ``"action"`` ``[*B]``."""
-        flat = tensordict.select(*self.in_keys).reshape(-1)
-        rows = torch.arange(flat.batch_size[0], device=flat.device)
-        output, rows = network_outputs([self], flat, rows, [rows.numel()])
-        logits = output[invert(rows)].view(*tensordict.batch_size, -1).masked_fill(~tensordict.get("action_mask"), -torch.inf)
-        return tensordict.update({"logits": logits, "action": logits.argmax(-1)})
+    def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
+        """``"logits"`` and ``"action"``; see the class."""
+        logits = output.masked_fill(~y.get("action_mask"), -torch.inf)
+        return TensorDict({"logits": logits, "action": logits.argmax(-1)}, y.batch_size)
 
 
-def network_outputs(
-    networks: Sequence[PolicyNetwork], y: TensorDictBase, rows: Tensor, counts: Sequence[int]
-) -> tuple[Tensor, Tensor]:
-    """Outputs of networks that share an encoder, each at rows of its own.
+class ValueNetwork(LocalNetwork):
+    r"""Value network :math:`\hat J(y,r)`, 256-128-64 in the paper; writes ``"state_value"`` ``[*B]``, a cost.
+
+    Costs-to-go span many orders of magnitude. The network gives their ratio to a known positive cost of the state, such as
+    that of never repairing, which lies in a narrow range.
+
+    Args:
+        encoder: encoder of feature states.
+        scale: positive costs ``[*B]`` of feature states ``[*B]`` from the encoder's entries.
+        hidden: sizes of the hidden layers.
+        generator: generator of the initial weights; the global one is left alone.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import FlatEncoder
+        >>> problem = make_problem("linear20")
+        >>> scale = lambda y: problem.model.expected_cost(y) + 1
+        >>> network = ValueNetwork(FlatEncoder(problem.model), scale, generator=torch.Generator().manual_seed(0))
+        >>> network(problem.start(torch.arange(6)))["state_value"].shape
+        torch.Size([6])
+    """
+
+    out_keys = ["state_value"]
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        scale: Callable[[TensorDictBase], Tensor],
+        hidden: Sequence[int] = (256, 128, 64),
+        *,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__(encoder, [*hidden, 1], generator)
+        self.scale = scale
+        self.in_keys = self.entry_keys = list(encoder.keys)
+
+    def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
+        """``"state_value"``; see the class."""
+        return TensorDict({"state_value": output.squeeze(-1) * self.scale(y)}, y.batch_size)
+
+
+def evaluate_networks(
+    networks: Sequence[LocalNetwork], y: TensorDictBase, rows: Tensor, counts: Sequence[int]
+) -> tuple[TensorDictBase, Tensor]:
+    """Entries of networks of one kind that share an encoder, each at rows of its own.
 
     Args:
         networks: the networks.
@@ -244,12 +138,12 @@ def network_outputs(
         counts: the first network is evaluated at the first ``counts[0]`` of ``rows``, the second at the next, ...
 
     Returns:
-        outputs ``[M, .]`` and the rows ``[M]`` that they belong to: ``rows``, reordered within each network's.
+        entries ``[M]``, and the rows ``[M]`` that they belong to: ``rows``, reordered within each network's.
     """
     first = [cast(nn.Linear, network.network[0]) for network in networks]
     hidden, rows = networks[0].encoder.first_layers(y, rows, first, counts)
-    outputs = [_rowwise(network.network[1:], block) for network, block in zip(networks, hidden, strict=True)]
-    return torch.cat(outputs), rows
+    outputs = [rowwise(network.network[1:], block) for network, block in zip(networks, hidden, strict=True)]
+    return networks[0].entries(torch.cat(outputs), take_rows(y.select(*networks[0].entry_keys), rows)), rows
 
 
 def invert(order: Tensor) -> Tensor:
@@ -266,19 +160,3 @@ def _relu_network(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequen
             nn.init.uniform_(parameter, -(fan_in**-0.5), fan_in**-0.5, generator=generator)
         layers += [layer, nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
-
-
-def _rowwise(network: nn.Module, features: Tensor) -> Tensor:
-    """``network`` on ``[*B, F]``, such that a row's output does not depend on the size of the batch."""
-    flat = features.reshape(-1, features.shape[-1])
-    missing = max(0, _MIN_ROWS - flat.shape[0])
-    output = network(nn.functional.pad(flat, (0, 0, 0, missing)) if missing else flat)
-    return output[: flat.shape[0]].reshape(*features.shape[:-1], output.shape[-1])
-
-
-def _window(graph: Graph) -> Tensor:
-    """Number of the offset from every location to every location, ``[L, L]``: row by row, as a window centred at the first."""
-    column, row = graph.columns.round().to(torch.int64), graph.rows.round().to(torch.int64)
-    across, down = column - column.unsqueeze(-1), row - row.unsqueeze(-1)
-    width = int(across.max() - across.min()) + 1
-    return (down - down.min()) * width + across - across.min()

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -16,7 +13,7 @@ from torchrl_pomdp.modules import PartitionedPolicy
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.policy_iteration import make_networks
 
-__all__ = ["Checkpoint", "create_run_folder", "load_checkpoint", "save_checkpoint", "write_atomically"]
+__all__ = ["Checkpoint", "create_run_folder", "load_checkpoint", "save_checkpoint"]
 
 _FORMAT = "torchrl_pomdp policy 1"
 
@@ -36,28 +33,6 @@ class Checkpoint:
     config: PolicyIterationConfig
     iteration: int
     policy: PartitionedPolicy
-
-
-def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let ``write`` make a temporary file beside ``path``, then rename it: ``path`` is never seen half written.
-
-    Args:
-        path: the file to make or replace.
-        write: called with the temporary path, which has the suffix of ``path``.
-
-    Examples:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_atomically(Path(folder) / "a.txt", lambda path: path.write_text("whole"))
-        ...     (Path(folder) / "a.txt").read_text()
-        'whole'
-    """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def create_run_folder(path: Path) -> Path:
