@@ -7,18 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_pomdp.collectors import Mixture, PartSampler, VisitedStates
+from torchrl_pomdp.collectors import PartSampler
 from torchrl_pomdp.envs import (
     CalibratedStart,
     InPart,
+    Mixture,
     RandomState,
     RepairPartition,
     SinglePart,
     grid,
     line,
-    make_problem,
 )
-from torchrl_pomdp.modules import GreedyRepair
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 
 
@@ -86,15 +85,6 @@ def test_calibrated_start_has_the_distribution_it_says(linear20):
     assert ((here == 0) | (here == 1)).all()
 
 
-def test_visited_states_lie_on_trajectories_of_the_policy(linear20):
-    model = linear20.model
-    keys = seed_keys(2, torch.arange(200))
-    visited = VisitedStates(model, linear20.start, GreedyRepair(model), exploration=0.0, part=4)
-    y = InPart(model, visited, 4)(keys)
-    assert (model.partition(y) == 4).all()
-    assert torch.equal(InPart(model, visited, 4)(keys[50:90])["belief"], y["belief"][50:90])
-
-
 def test_sampler_numbers_states_evenly_over_parts(linear20):
     mixture = Mixture([linear20.training[0], linear20.start], [1.0, 0.0])
     sampler = PartSampler({0: mixture, 5: linear20.training[5]}, seed=4)
@@ -105,8 +95,6 @@ def test_sampler_numbers_states_evenly_over_parts(linear20):
 
 def test_bad_arguments_are_refused(linear20):
     model = linear20.model
-    with pytest.raises(ValueError, match=r"unknown preset 'linear30'; known presets: line3, linear20"):
-        make_problem("linear30")
     with pytest.raises(ValueError, match="damaged_fraction"):
         CalibratedStart(model, 0.0)
     with pytest.raises(ValueError, match="fractions"):
@@ -123,10 +111,6 @@ def test_bad_arguments_are_refused(linear20):
         Mixture([linear20.start], [-1.0])
     with pytest.raises(ValueError, match="generators is empty"):
         PartSampler({}, seed=0)
-    with pytest.raises(ValueError, match="exploration"):
-        VisitedStates(model, linear20.start, GreedyRepair(model), exploration=1.5)
-    with pytest.raises(ValueError, match="max_steps"):
-        VisitedStates(model, linear20.start, GreedyRepair(model), max_steps=0)
     assert SinglePart().num_parts == 1
 
 

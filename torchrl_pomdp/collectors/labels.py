@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from torchrl_pomdp.modules.rollout import Policy
 __all__ = ["LabelCollector"]
 
 # States drawn, and kept, at once, and labelled between two updates of the progress bar; the data do not depend on either.
-_DRAWN, _LABELLED = 32768, 1024
+_DRAWN, _LABELLED = 32768, 4096
 
 
 class LabelCollector(Collector):
@@ -51,6 +52,10 @@ class LabelCollector(Collector):
         progress: whether to show a progress bar with the labelling rate.
         name: what the progress bar calls the work.
         kwargs: further arguments of ``torchrl.collectors.Collector``.
+
+    Attributes:
+        simulated_steps: belief steps of the simulations behind the labels so far, cached ones too.
+        seconds: time that they and drawing the states took.
 
     Raises:
         TypeError: if the environment is not a :class:`BeliefEnv`.
@@ -90,7 +95,7 @@ class LabelCollector(Collector):
             raise TypeError(f"create_env_fn must give a BeliefEnv, got {type(self.env).__name__}")
         self.states, self.num_workers, self.cache, self.progress, self.name = states, num_workers, cache, progress, name
         self.labeller = label(self.env.model, self.policy)
-        self._batches = 0
+        self._batches, self.simulated_steps, self.seconds = 0, 0, 0.0
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
@@ -110,15 +115,21 @@ class LabelCollector(Collector):
         """Labelled states with the given numbers ``[N]``, from the cache where they are there."""
         path = self.cache / f"{int(numbers[0]):012d}-{numbers.numel()}.pt" if self.cache is not None else None
         if path is not None and path.is_file():
+            content = load_tensors(path, self.env.device)
+            self.simulated_steps += content["simulated_steps"]
+            self.seconds += content["seconds"]
             bar.update(numbers.numel())
-            return TensorDict(load_tensors(path, self.env.device), numbers.shape, device=self.env.device)
-        labelled = []
+            return TensorDict(content["states"], numbers.shape, device=self.env.device)
+        labelled, before, begin = [], self.labeller.simulated_steps, time.perf_counter()
         for y in self.env.model.with_features(self.states(numbers)).split(_LABELLED):
             labelled.append(self.labeller(y))
             bar.update(y.batch_size.numel())
         block: Any = torch.cat(labelled, 0)
+        steps, seconds = self.labeller.simulated_steps - before, time.perf_counter() - begin
+        self.simulated_steps += steps
+        self.seconds += seconds
         if path is not None:
-            save_tensors(path, block.to_dict())
+            save_tensors(path, {"states": block.to_dict(), "simulated_steps": steps, "seconds": seconds})
         return block
 
     def state_dict(self) -> dict[str, Any]:

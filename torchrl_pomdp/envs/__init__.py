@@ -1,7 +1,7 @@
 """Belief models and the environments over them (paper, Sections II and VI)."""
 
 from torchrl_pomdp.envs.belief import BeliefEnv, BeliefModel, StateGenerator
-from torchrl_pomdp.envs.generators import CalibratedStart, FixedBelief, InPart, RandomState, UniformStart
+from torchrl_pomdp.envs.generators import CalibratedStart, FixedBelief, InPart, Mixture, RandomState, UniformStart
 from torchrl_pomdp.envs.graphs import Graph, grid, line
 from torchrl_pomdp.envs.partition import Partition, RepairPartition, SinglePart
 from torchrl_pomdp.envs.presets import PRESETS, Problem, make_problem
@@ -17,6 +17,7 @@ __all__ = [
     "FixedBelief",
     "Graph",
     "InPart",
+    "Mixture",
     "Partition",
     "Problem",
     "RandomState",

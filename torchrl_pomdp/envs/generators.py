@@ -6,18 +6,20 @@ the starts of environments and evaluations and the training states of each part 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
+from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf
 from torchrl_pomdp.envs.repair import RepairModel
 from torchrl_pomdp.noise import fold, uniform
 
-__all__ = ["CalibratedStart", "FixedBelief", "InPart", "RandomState", "UniformStart"]
+__all__ = ["CalibratedStart", "FixedBelief", "InPart", "Mixture", "RandomState", "UniformStart", "draw_each"]
 
 # What a key's independent streams of uniforms are for.
-_ORDER, _LEVELS, _ROBOTS, _OBSERVE, _FRACTION, _AGE, _RETRY = range(7)
+_ORDER, _LEVELS, _ROBOTS, _OBSERVE, _FRACTION, _AGE, _RETRY, _CHOICE = range(8)
 # Candidates that a rejection round makes at once.
 _BATCH = 4096
 
@@ -138,7 +140,6 @@ class InPart:
         proposal: generator of candidate states.
         part: the part that states must lie in.
         max_tries: candidates for one state before giving up.
-        fallback: generator of states of the part for keys without an acceptable candidate; None raises.
 
     Raises:
         ValueError: if ``part`` is not a part of the model's partition; when called, if a state has no acceptable
@@ -152,19 +153,12 @@ class InPart:
         [2]
     """
 
-    def __init__(
-        self,
-        model: BeliefModel,
-        proposal: StateGenerator,
-        part: int,
-        max_tries: int = 500,
-        fallback: StateGenerator | None = None,
-    ) -> None:
+    def __init__(self, model: BeliefModel, proposal: StateGenerator, part: int, max_tries: int = 500) -> None:
         if model.partition is None or not 0 <= part < model.partition.num_parts:
             parts = 0 if model.partition is None else model.partition.num_parts
             raise ValueError(f"part must be one of the model's {parts} parts, got {part}")
         self.model, self.proposal, self.part, self.max_tries = model, proposal, part, max_tries
-        self.partition, self.fallback = model.partition, fallback
+        self.partition = model.partition
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` of the part for int64 keys ``[*B]``; terminal states are rejected too."""
@@ -183,9 +177,6 @@ class InPart:
             chosen = torch.arange(missing.numel(), device=keys.device) * width + first
             result[missing[found]] = candidates[chosen[found]]
             missing = missing[~found]
-        if missing.numel() and self.fallback is not None:
-            result[missing] = self.fallback(flat[missing])
-            missing = missing[:0]
         if missing.numel() == 0:
             return result.view(keys.shape)
         raise ValueError(
@@ -195,6 +186,36 @@ class InPart:
 
     def _accepted(self, y: TensorDictBase) -> Tensor:
         return (self.partition(y) == self.part) & ~self.model.is_terminal(y)
+
+
+class Mixture:
+    """Generator that draws each state from one of several generators.
+
+    Args:
+        generators: the generators that are mixed.
+        weights: their probabilities, nonnegative with positive sum.
+
+    Raises:
+        ValueError: if there is not one nonnegative weight for each generator.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> problem = make_problem("linear20")
+        >>> Mixture([problem.start, problem.training[4]], [0.5, 0.5])(torch.arange(8)).batch_size
+        torch.Size([8])
+    """
+
+    def __init__(self, generators: Sequence[StateGenerator], weights: Sequence[float]) -> None:
+        if len(generators) != len(weights) or not generators or min(weights) < 0 or sum(weights) <= 0:
+            raise ValueError(f"weights must be {len(generators)} nonnegative numbers with positive sum, got {list(weights)}")
+        self.generators, self.weights = list(generators), torch.tensor(weights, dtype=torch.float32)
+
+    def __call__(self, keys: Tensor) -> TensorDictBase:
+        """Feature states ``[*B]`` for int64 keys ``[*B]``."""
+        flat = keys.reshape(-1)
+        probs = self.weights.to(keys.device).expand(flat.numel(), -1)
+        which = inverse_cdf(probs, uniform(fold(flat, _CHOICE), 0))
+        return draw_each(self.generators, which, flat).view(keys.shape)
 
 
 class FixedBelief:
@@ -214,6 +235,12 @@ class FixedBelief:
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` for int64 keys ``[*B]``."""
         return TensorDict({"belief": self.belief.expand(*keys.shape, -1).clone()}, batch_size=keys.shape)
+
+
+def draw_each(generators: Sequence[StateGenerator], which: Tensor, keys: Tensor) -> TensorDictBase:
+    """States ``[N]`` for keys ``[N]``, the i-th from the generator number ``which[i]``."""
+    drawn = [generator(keys[which == i]) for i, generator in enumerate(generators) if bool((which == i).any())]
+    return torch.cat(drawn, 0)[which.argsort(stable=True).argsort()]
 
 
 def _uniforms(keys: Tensor, purpose: int, count: int) -> Tensor:

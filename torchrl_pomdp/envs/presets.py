@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 
 from torchrl_pomdp.envs.belief import StateGenerator
-from torchrl_pomdp.envs.generators import CalibratedStart, InPart, RandomState, UniformStart
+from torchrl_pomdp.envs.generators import CalibratedStart, InPart, Mixture, RandomState, UniformStart
 from torchrl_pomdp.envs.graphs import Graph, grid, line
-from torchrl_pomdp.envs.partition import RepairPartition
+from torchrl_pomdp.envs.partition import Partition, RepairPartition, SinglePart
 from torchrl_pomdp.envs.repair import RepairModel, damage_chain
 
 __all__ = ["PRESETS", "Problem", "make_problem"]
@@ -29,19 +29,42 @@ class Problem:
         model: the belief model.
         start: start states of play and evaluation.
         training: one generator of random training states for each part of the model's partition.
+        partitioned: whether the model has the preset's partition, or a single part.
     """
 
     name: str
     model: RepairModel
     start: StateGenerator
     training: tuple[StateGenerator, ...]
+    partitioned: bool = True
 
 
-def make_problem(name: str, *, device: torch.device | str = "cpu") -> Problem:
+@dataclass(frozen=True)
+class _Preset:
+    """A graph, the number of robots, and the distribution of start states of a model."""
+
+    graph: Graph
+    num_robots: int = 1
+    start: Callable[[RepairModel], StateGenerator] = CalibratedStart
+
+
+PRESETS: dict[str, _Preset] = {
+    "line3": _Preset(line(3), start=UniformStart),
+    "linear20": _Preset(line(20)),
+    "grid5x4": _Preset(grid(5, 4)),
+    "grid6x6": _Preset(grid(6, 6)),
+    "two_robots20": _Preset(line(20), num_robots=2),
+}
+"""The known problems by name."""
+
+
+def make_problem(name: str, *, partitioned: bool = True, device: torch.device | str = "cpu") -> Problem:
     """Build a problem by name.
 
     Args:
         name: one of :data:`PRESETS`.
+        partitioned: whether the model has the six parts of Section VI-B, or a single one. The training states of the single
+            part are those of the six, in equal shares.
         device: where the model computes.
 
     Raises:
@@ -50,17 +73,24 @@ def make_problem(name: str, *, device: torch.device | str = "cpu") -> Problem:
     Examples:
         >>> make_problem("linear20").model.describe()
         'line of 20, 1 robot: 1.9e+15 states, 3 controls, 5 observations, discount 0.99'
+        >>> make_problem("grid5x4", partitioned=False).model.partition.num_parts
+        1
     """
     if name not in PRESETS:
         raise ValueError(f"unknown preset {name!r}; known presets: {', '.join(sorted(PRESETS))}")
-    return PRESETS[name](name, torch.device(device))
+    preset = PRESETS[name]
+    six = RepairPartition(preset.graph, torch.tensor(COSTS), device=device)
+    model = _repair_model(preset, six, device)
+    training = _training(model)
+    if not partitioned:
+        model, training = _repair_model(preset, SinglePart(), device), (Mixture(training, [1.0] * len(training)),)
+    return Problem(name, model, preset.start(model), training, partitioned)
 
 
-def _repair_model(graph: Graph, num_robots: int, device: torch.device) -> RepairModel:
-    costs = torch.tensor(COSTS)
-    partition = RepairPartition(graph, costs, device=device)
+def _repair_model(preset: _Preset, partition: Partition, device: torch.device | str) -> RepairModel:
+    chain, costs = damage_chain(DEGRADATION), torch.tensor(COSTS)
     return RepairModel(
-        graph, damage_chain(DEGRADATION), costs, DISCOUNT, num_robots=num_robots, partition=partition, device=device
+        preset.graph, chain, costs, DISCOUNT, num_robots=preset.num_robots, partition=partition, device=device
     )
 
 
@@ -69,23 +99,3 @@ def _training(model: RepairModel) -> tuple[StateGenerator, ...]:
     startgame, endgame = RandomState(model, (0.5, 1.0)), RandomState(model, (0.0, 0.5))
     parts = range(6)
     return tuple(InPart(model, startgame if part < 3 else endgame, part) for part in parts)
-
-
-def _repair_problem(name: str, graph: Graph, num_robots: int, device: torch.device) -> Problem:
-    model = _repair_model(graph, num_robots, device)
-    return Problem(name, model, CalibratedStart(model), _training(model))
-
-
-def _line3(name: str, device: torch.device) -> Problem:
-    model = _repair_model(line(3), 1, device)
-    return Problem(name, model, UniformStart(model), _training(model))
-
-
-PRESETS: dict[str, Callable[[str, torch.device], Problem]] = {
-    "line3": _line3,
-    "linear20": lambda name, device: _repair_problem(name, line(20), 1, device),
-    "grid5x4": lambda name, device: _repair_problem(name, grid(5, 4), 1, device),
-    "grid6x6": lambda name, device: _repair_problem(name, grid(6, 6), 1, device),
-    "two_robots20": lambda name, device: _repair_problem(name, line(20), 2, device),
-}
-"""Builders of the known problems, by name."""

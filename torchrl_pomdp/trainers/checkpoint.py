@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from torchrl_pomdp.envs.presets import Problem, make_problem
-from torchrl_pomdp.modules import PartitionedPolicy
+from torchrl_pomdp.files import load_tensors, save_tensors, write_json
+from torchrl_pomdp.modules import NeverRepairCost, PartitionedPolicy, PartitionedValue, ValueNetwork
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
-from torchrl_pomdp.trainers.policy_iteration import make_networks
+from torchrl_pomdp.trainers.policy_iteration import make_networks, make_values
 
-__all__ = ["Checkpoint", "create_run_folder", "load_checkpoint", "save_checkpoint"]
+__all__ = ["Checkpoint", "load_checkpoint", "open_run_folder", "save_checkpoint"]
 
-_FORMAT = "torchrl_pomdp policy 1"
+_FORMAT = "torchrl_pomdp policy 2"
 
 
 @dataclass(frozen=True)
@@ -23,33 +25,49 @@ class Checkpoint:
     """A trained policy with all that is needed to use it.
 
     Attributes:
-        problem: the problem it was trained on.
+        problem: the problem it was trained on, with its partition.
         config: how it was trained.
+        algorithm: name of the algorithm, such as pAPI-NT.
         iteration: number of the policy iteration that made it, from 1.
         policy: the partitioned policy.
+        value: the partitioned terminal cost; never repairing in the parts without a value network.
     """
 
     problem: Problem
     config: PolicyIterationConfig
+    algorithm: str
     iteration: int
     policy: PartitionedPolicy
+    value: PartitionedValue
 
 
-def create_run_folder(path: Path) -> Path:
-    """Make the folder of a new run.
+def open_run_folder(path: Path, identity: dict[str, Any]) -> Path:
+    """Make the folder of a run, or open it again to go on with the same run.
+
+    Args:
+        path: the folder.
+        identity: all that decides the run's results, as JSON; kept in ``config.json``.
 
     Raises:
-        ValueError: if it exists and is not an empty folder; nothing in it is touched.
+        ValueError: if the folder is in use and not by this very run; nothing in it is touched.
 
     Examples:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     create_run_folder(Path(folder) / "run").name
-        'run'
+        ...     path = open_run_folder(Path(folder) / "run", {"seed": 0})
+        ...     open_run_folder(path, {"seed": 0}) == path
+        True
     """
+    record = path / "config.json"
+    if record.is_file():
+        found = json.loads(record.read_text())
+        differing = sorted(k for k in {*found, *identity} if found.get(k) != json.loads(json.dumps(identity)).get(k))
+        if not differing:
+            return path
+        raise ValueError(f"run folder {path} holds another run, which differs in {', '.join(differing)}: name another folder")
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise ValueError(f"run folder {path} is in use: name a folder that is empty or does not exist")
-    path.mkdir(parents=True, exist_ok=True)
+        raise ValueError(f"run folder {path} is in use: name a folder that is empty, does not exist, or holds this run")
+    write_json(record, identity)
     return path
 
 
@@ -63,11 +81,14 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     about = {
         "format": _FORMAT,
         "problem": checkpoint.problem.name,
+        "partitioned": checkpoint.problem.partitioned,
         "config": asdict(checkpoint.config),
+        "algorithm": checkpoint.algorithm,
         "iteration": checkpoint.iteration,
+        "value_parts": [part for part, value in enumerate(checkpoint.value.values) if isinstance(value, ValueNetwork)],
     }
-    content = {"about": json.dumps(about), "policy": checkpoint.policy.state_dict()}
-    write_atomically(path, lambda temporary: torch.save(content, temporary))
+    policy, value = checkpoint.policy.state_dict(), checkpoint.value.state_dict()
+    save_tensors(path, {"about": json.dumps(about), "policy": policy, "value": value})
 
 
 def load_checkpoint(path: Path, *, device: torch.device | str = "cpu") -> Checkpoint:
@@ -83,24 +104,31 @@ def load_checkpoint(path: Path, *, device: torch.device | str = "cpu") -> Checkp
     Examples:
         >>> import tempfile
         >>> problem, config = make_problem("line3"), PolicyIterationConfig()
+        >>> policy, value = make_networks(problem, config, seed=0), make_values(problem, config, seed=0)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = Path(folder) / "policy.pt"
-        ...     save_checkpoint(path, Checkpoint(problem, config, 1, make_networks(problem, config, seed=0)))
+        ...     save_checkpoint(path, Checkpoint(problem, config, "pAPI-NT", 1, policy, value))
         ...     load_checkpoint(path).problem.name
         'line3'
     """
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path}")
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
+        content = load_tensors(path, device)
         about = json.loads(content["about"])
         if about["format"] != _FORMAT:
             raise ValueError(f"its format is {about['format']!r}, expected {_FORMAT!r}")
-        about["config"]["hidden"] = tuple(about["config"]["hidden"])
+        for name in ("hidden", "value_hidden"):
+            about["config"][name] = tuple(about["config"][name])
         config = PolicyIterationConfig(**about["config"])
-        problem = make_problem(about["problem"], device=device)
+        problem = make_problem(about["problem"], partitioned=about["partitioned"], device=device)
         policy = make_networks(problem, config, seed=0)
         policy.load_state_dict(content["policy"])
+        networks = make_values(problem, config, 0, policy.policies[0].encoder).values
+        closed_form = NeverRepairCost(problem.model)
+        trained = about["value_parts"]
+        value = PartitionedValue([v if part in trained else closed_form for part, v in enumerate(networks)])
+        value.load_state_dict(content["value"])
     except Exception as error:  # torch.load raises whatever a foreign file happens to trigger
         raise ValueError(f"{path} is damaged or no checkpoint of this library: {error}") from error
-    return Checkpoint(problem, config, about["iteration"], policy.eval())
+    return Checkpoint(problem, config, about["algorithm"], about["iteration"], policy.eval(), value.eval())

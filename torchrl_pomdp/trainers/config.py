@@ -7,6 +7,11 @@ from typing import Literal
 
 __all__ = ["PolicyIterationConfig"]
 
+_POSITIVE = (
+    "iterations", "samples_per_part", "trajectories", "max_steps", "visits", "memory_capacity", "value_samples",
+    "batch_size", "epochs", "validation_states",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class PolicyIterationConfig:
@@ -42,16 +47,28 @@ class PolicyIterationConfig:
     """Stages after which a simulated trajectory is cut."""
 
     visited_share: float = 0.5
-    """Share of the training states taken from trajectories of the last policy, in [0, 1]; the rest are random."""
+    """Share of the training states taken from the memory of visited states, in [0, 1]; the rest are random."""
+
+    visits: int = 20_000
+    """Trajectories of the current policy in each iteration, of whose states the memory retains a tenth."""
 
     exploration: float = 0.15
     """Probability of a random control at each stage of those trajectories, in [0, 1]."""
+
+    memory_capacity: int = 100_000
+    """Largest number of states of a part in the memory."""
 
     encoder: Literal["relative", "flat"] = "relative"
     """Network input: beliefs at offsets from the robot, or the flattened beliefs and one-hot location of the paper."""
 
     hidden: tuple[int, ...] = (256, 64)
     """Sizes of the policy networks' hidden layers."""
+
+    value_hidden: tuple[int, ...] = (256, 128, 64)
+    """Sizes of the value networks' hidden layers."""
+
+    value_samples: int = 200_000
+    """States labelled with a simulated cost for each value network."""
 
     loss: Literal["soft", "cross_entropy", "cost_weighted", "l2"] = "soft"
     """Classification loss, see ClassificationLoss; l2 is the paper's."""
@@ -65,11 +82,14 @@ class PolicyIterationConfig:
     epochs: int = 12
     """Passes over the labelled states."""
 
+    validation_states: int = 10_000
+    """Start states on which an iteration's policy is compared with the best one so far."""
+
     seed: int = 0
     """Seed of everything that is random: states, labels, initial weights, batches."""
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "samples_per_part", "trajectories", "max_steps", "batch_size", "epochs"):
+        for name in _POSITIVE:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         for name in ("visited_share", "exploration"):
@@ -77,5 +97,7 @@ class PolicyIterationConfig:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
         if not self.learning_rate > 0.0:
             raise ValueError(f"learning_rate must be positive, got {self.learning_rate}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise ValueError(f"hidden must hold positive layer sizes, got {self.hidden}")
+        for name in ("hidden", "value_hidden"):
+            sizes = getattr(self, name)
+            if not sizes or min(sizes) < 1:
+                raise ValueError(f"{name} must hold positive layer sizes, got {sizes}")

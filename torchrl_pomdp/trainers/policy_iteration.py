@@ -1,45 +1,119 @@
-"""Approximate policy iteration with a partitioned architecture and no truncation, pAPI-NT (paper, Sections IV to VI).
+r"""Approximate policy iteration with partitioned policies and values (paper, Sections IV to VI).
 
-One iteration improves the base policy part by part, in the partition's stages: a stage labels states of its parts with the
-rollout control, its networks learn the labels, and from then on they are the base policy in those parts, so that the
-startgame is rolled out with the endgame networks of the same iteration. A stage is one run of TorchRL's ``Trainer``.
+One iteration follows a *plan*: a sequence of steps, each of which trains networks for some parts. :class:`Improve` teaches
+policy networks the rollout control of the current policy, :class:`Evaluate` teaches value networks its cost. What a step has
+trained is the base policy, or the terminal cost, of the steps after it: with a plan that takes the partition's stages in their
+order, the startgame is rolled out with the endgame networks of the same iteration. The paper's algorithms are plans, see
+:mod:`torchrl_pomdp.trainers.recipes`.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import LazyTensorStorage, ReplayBufferEnsemble, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.record.loggers import Logger
-from torchrl.trainers import DefaultOptimizationStepper, Trainer
-from tqdm import tqdm
 
-from torchrl_pomdp.collectors import PartSampler, RolloutImprovement, training_states
+from torchrl_pomdp.collectors import PartSampler, PolicyEvaluation, RolloutImprovement, StateMemory, training_states
 from torchrl_pomdp.envs.belief import BeliefEnv
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.presets import Problem
-from torchrl_pomdp.modules import FlatEncoder, PartitionedPolicy, PolicyNetwork, RelativeEncoder, RolloutPolicy
-from torchrl_pomdp.objectives import ClassificationLoss
+from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
+from torchrl_pomdp.files import load_tensors, save_tensors
+from torchrl_pomdp.modules import (
+    Encoder,
+    FlatEncoder,
+    NeverRepairCost,
+    PartitionedPolicy,
+    PartitionedValue,
+    PolicyCost,
+    PolicyNetwork,
+    RelativeEncoder,
+    RolloutPolicy,
+    Truncation,
+    ValueNetwork,
+)
+from torchrl_pomdp.modules.networks import LocalNetwork
+from torchrl_pomdp.noise import seed_keys
+from torchrl_pomdp.objectives import ClassificationLoss, ValueLoss
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
+from torchrl_pomdp.trainers.parts import PartRecord, train_part
 
-__all__ = ["PolicyIteration", "make_networks"]
+__all__ = ["Evaluate", "Improve", "Iteration", "PolicyIteration", "Step", "make_networks", "make_values"]
 
 _ENCODERS = {"flat": FlatEncoder, "relative": RelativeEncoder}
-_LOG_INTERVAL = 50
+# What seeds are for; an iteration's validation is the same for all iterations.
+_PURPOSES = ("weights", "states", "labels", "batches", "visits", "validation")
 
 
-def make_networks(problem: Problem, config: PolicyIterationConfig, seed: int) -> PartitionedPolicy:
+@dataclass(frozen=True)
+class Improve:
+    """Step of a plan: teach the policy networks of some parts the rollout control of the current policy.
+
+    Attributes:
+        parts: the parts, which are trained independently of each other.
+        truncation: rule that cuts the simulations; the current values are the terminal cost. None: no truncation.
+    """
+
+    parts: tuple[int, ...]
+    truncation: Truncation | None = None
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Step of a plan: teach the value networks of some parts the cost of the current (global) policy.
+
+    Attributes:
+        parts: the parts, which are trained independently of each other.
+        truncation: as for :class:`Improve`.
+    """
+
+    parts: tuple[int, ...]
+    truncation: Truncation | None = None
+
+
+Step = Improve | Evaluate
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """What an iteration has made.
+
+    Attributes:
+        number: from 1.
+        policy: the trained policy.
+        value: terminal cost: the trained value networks, and never repairing where there are none.
+        accepted: whether it is the best policy so far.
+        reason: why, in words with numbers.
+        comparison: costs against the best policy before, on the validation states.
+        records: what the training of each part took, by step and part.
+    """
+
+    number: int
+    policy: PartitionedPolicy
+    value: PartitionedValue
+    accepted: bool
+    reason: str
+    comparison: Comparison
+    records: dict[str, PartRecord] = field(repr=False)
+
+
+def make_networks(problem: Problem, config: PolicyIterationConfig, seed: int, encoder: Encoder | None = None) -> PartitionedPolicy:
     """An untrained partitioned policy: one policy network for each part of the problem's partition.
 
     Args:
         problem: the problem.
         config: sizes and encoding.
         seed: seed of the initial weights.
+        encoder: encoder that the networks share; by default a new one as the configuration says.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -48,37 +122,67 @@ def make_networks(problem: Problem, config: PolicyIterationConfig, seed: int) ->
     """
     model = problem.model
     generator = torch.Generator(device=model.device).manual_seed(seed)
-    encoder = _ENCODERS[config.encoder](model)
-    num_parts = _partition(problem).num_parts
+    encoder = encoder or _ENCODERS[config.encoder](model)
+    parts = range(_partition(problem).num_parts)
     return PartitionedPolicy(
-        [PolicyNetwork(encoder, model.num_controls, config.hidden, generator=generator) for _ in range(num_parts)]
+        [PolicyNetwork(encoder, model.num_controls, config.hidden, generator=generator) for _ in parts]
     )
 
 
+def make_values(problem: Problem, config: PolicyIterationConfig, seed: int, encoder: Encoder | None = None) -> PartitionedValue:
+    """An untrained partitioned value: one value network for each part, in multiples of the cost of never repairing.
+
+    Args:
+        problem: the problem.
+        config: sizes and encoding.
+        seed: seed of the initial weights.
+        encoder: encoder that the networks share; by default a new one as the configuration says.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> len(make_values(make_problem("linear20"), PolicyIterationConfig(), seed=0).values)
+        6
+    """
+    model = problem.model
+    generator = torch.Generator(device=model.device).manual_seed(seed)
+    encoder = encoder or _ENCODERS[config.encoder](model)
+    parts, scale = range(_partition(problem).num_parts), NeverRepairCost(model)
+    return PartitionedValue([ValueNetwork(encoder, scale, config.value_hidden, generator=generator) for _ in parts])
+
+
 class PolicyIteration:
-    r"""Policy iteration from a base policy: an iterator over the policies :math:`\hat\mu_1,\hat\mu_2,\dots`.
+    r"""Policy iteration from a base policy: an iterator over its iterations, and the best policy so far.
+
+    An iteration starts from the best policy so far. Its policy is accepted if, on fixed validation states and under the same
+    noise, its mean cost is lower with 95 % confidence; a rejected one is dropped, and the next iteration tries again with other
+    training states.
+
+    With a ``folder`` every trained part and every block of labels is kept there as soon as it is there. The same iteration
+    with the same folder goes on where an earlier one was interrupted, and gives the same result.
 
     Args:
         problem: model, start states and training states.
         config: the numbers.
         base_policy: the policy :math:`\mu_0` that is improved first.
+        plan: the steps of an iteration.
 
     Keyword Args:
+        folder: where the run is kept; None keeps nothing.
         logger: TorchRL logger of losses; None logs nothing.
         progress: whether to show progress bars with rates.
 
     Raises:
-        ValueError: if the problem's model has no partition.
+        ValueError: if the problem's model has no partition or the plan is empty.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
         >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.trainers import papi_nt
         >>> problem = make_problem("line3")
-        >>> config = PolicyIterationConfig(iterations=1, samples_per_part=40, trajectories=2, epochs=1, batch_size=20)
-        >>> policies = list(PolicyIteration(problem, config, GreedyRepair(problem.model)))
-        >>> y = problem.model.with_features(problem.start(torch.arange(5)))
-        >>> policies[0](y)["action"].shape
-        torch.Size([5])
+        >>> config = PolicyIterationConfig(iterations=1, samples_per_part=40, trajectories=2, epochs=1, validation_states=50)
+        >>> run = papi_nt(problem, config, GreedyRepair(problem.model))
+        >>> [iteration.accepted for iteration in run], run.best is run.base_policy
+        ([False], True)
     """
 
     def __init__(
@@ -86,150 +190,143 @@ class PolicyIteration:
         problem: Problem,
         config: PolicyIterationConfig,
         base_policy: TensorDictModuleBase,
+        plan: Sequence[Step],
         *,
+        folder: Path | None = None,
         logger: Logger | None = None,
         progress: bool = False,
     ) -> None:
-        self.problem, self.config, self.logger, self.progress = problem, config, logger, progress
         self.partition = _partition(problem)
-        self.base_policy = base_policy
+        if not plan:
+            raise ValueError("plan is empty: an iteration needs at least one step")
+        self.problem, self.config, self.base_policy, self.plan = problem, config, base_policy, tuple(plan)
+        self.folder, self.logger, self.progress = folder, logger, progress
+        self.best: TensorDictModuleBase = base_policy
+        self.memory = StateMemory(problem.model, config.memory_capacity, seed=self._seed(0, "visits"))
+        self._scale = NeverRepairCost(problem.model)
+        self._values: list[TensorDictModuleBase] = [self._scale] * self.partition.num_parts
+        self._encoder = _shared_encoder(base_policy) or _ENCODERS[config.encoder](problem.model)
 
-    def __iter__(self) -> Iterator[PartitionedPolicy]:
-        """Yield the policy of every iteration, in order."""
-        policy: TensorDictModuleBase = self.base_policy
-        for iteration in range(self.config.iterations):
-            policy = self.improve(policy, iteration)
-            yield policy
+    def __iter__(self) -> Iterator[Iteration]:
+        """Carry out the iterations, in order."""
+        best_costs = self._validate(self.best, "base policy")
+        for number in range(1, self.config.iterations + 1):
+            local, values, records = self._iterate(number)
+            policy = PartitionedPolicy(local).eval()
+            costs = self._validate(policy, f"iteration {number}")
+            comparison = compare(costs, best_costs)
+            accepted, reason = _judge(comparison)
+            self._values = values
+            if accepted:
+                self.best, best_costs = policy, costs
+            yield Iteration(number, policy, PartitionedValue(values).eval(), accepted, reason, comparison, records)
 
-    def improve(self, base: TensorDictModuleBase, iteration: int) -> PartitionedPolicy:
-        """One policy iteration: the trained approximation of the rollout policy of ``base``.
+    def _iterate(self, number: int) -> tuple[list[Any], list[Any], dict[str, PartRecord]]:
+        """The local policies and values after one iteration from the best policy."""
+        config, best = self.config, self.best
+        local = list(best.policies) if isinstance(best, PartitionedPolicy) else [best] * self.partition.num_parts
+        values, records = list(self._values), {}
+        keys = seed_keys(self._seed(number, "visits"), torch.arange(config.visits, device=self.problem.model.device))
+        self.memory.visit(PartitionedPolicy(local), self.problem.start, keys, exploration=config.exploration)
+        for index, step in enumerate(self.plan):
+            networks = {}
+            for part in step.parts:
+                name = f"iteration-{number}/{index + 1}-{type(step).__name__.lower()}-part-{part}"
+                networks[part] = self._initial(step, part, local, values, number)
+                records[name] = self._train(step, part, networks[part], local, values, number, name)
+            for part, network in networks.items():
+                (local if isinstance(step, Improve) else values)[part] = network.eval()
+        return local, values, records
 
-        Args:
-            base: the current policy.
-            iteration: number of the iteration; random numbers depend on it and on the seed.
-        """
-        local = list(base.policies) if isinstance(base, PartitionedPolicy) else [base] * self.partition.num_parts
-        networks = self._initial_networks(base, iteration)
-        for stage in self.partition.stages:
-            self._train_stage(networks, PartitionedPolicy(local), stage, iteration)
-            for part in stage:
-                local[part] = networks.policies[part]
-        return networks.eval()
+    def _initial(self, step: Step, part: int, local: list[Any], values: list[Any], number: int) -> LocalNetwork:
+        """The network to train: the one that the part has, or a new one."""
+        old = (local if isinstance(step, Improve) else values)[part]
+        if isinstance(old, LocalNetwork):
+            # The encoder has no weights; shared, it lets networks be evaluated together.
+            return copy.deepcopy(old, {id(old.encoder): old.encoder})
+        seed = self._seed(number, "weights", part)
+        if isinstance(step, Improve):
+            return make_networks(self.problem, self.config, seed, self._encoder).policies[part]
+        return make_values(self.problem, self.config, seed, self._encoder).values[part]
 
-    def _initial_networks(self, base: TensorDictModuleBase, iteration: int) -> PartitionedPolicy:
-        """Networks to train: those of ``base`` again, or new ones where it has none."""
-        if isinstance(base, PartitionedPolicy) and all(isinstance(p, PolicyNetwork) for p in base.policies):
-            return copy.deepcopy(base)
-        return make_networks(self.problem, self.config, self._seed(iteration, "weights"))
-
-    def _seed(self, iteration: int, purpose: str, stage: int = 0) -> int:
-        """A seed for one purpose of one stage of one iteration."""
-        purposes = ("weights", "states", "labels", "batches")
-        return ((self.config.seed * 1000 + iteration) * 100 + stage) * len(purposes) + purposes.index(purpose)
-
-    def _train_stage(
-        self, networks: PartitionedPolicy, base: PartitionedPolicy, stage: tuple[int, ...], iteration: int
-    ) -> None:
-        """Label states of the parts ``stage`` with the rollout of ``base`` and train their networks in place."""
-        config, number = self.config, self.partition.stages.index(stage)
-        frames = config.samples_per_part * len(stage)
-        loss = ClassificationLoss(networks, config.loss)
-        steps = max(1, config.epochs * config.samples_per_part // config.batch_size)
-        optimizer = torch.optim.RMSprop(loss.parameters(), config.learning_rate)
-        name = f"iteration-{iteration + 1}-stage-{number + 1}"
-        trainer = Trainer(
-            collector=self._collector(base, stage, iteration, frames),
-            total_frames=frames,
-            frame_skip=1,
-            optim_steps_per_batch=steps,
-            loss_module=loss,
-            optimizer=optimizer,
-            optimization_stepper=_Stepper(optimizer, steps, name, self.logger, self.progress),
-            progress_bar=False,
-        )
-        buffers = self._buffers(stage, self._seed(iteration, "batches", number))
-        trainer.register_op("batch_process", partial(_store, buffers))
-        trainer.register_op("process_optim_batch", partial(_sample, buffers))
-        try:
-            trainer.train()
-        finally:
-            trainer.collector.shutdown()
-
-    def _collector(self, base: PartitionedPolicy, stage: tuple[int, ...], iteration: int, frames: int) -> RolloutImprovement:
-        config, problem = self.config, self.problem
-        number = self.partition.stages.index(stage)
-        label = partial(
-            RolloutPolicy,
-            trajectories=config.trajectories,
-            leaves=config.leaves,
-            allocation=config.allocation,
-            max_steps=config.max_steps,
-            seed=self._seed(iteration, "labels", number),
-        )
-        share = {"visited_share": config.visited_share, "exploration": config.exploration}
-        generators = {part: training_states(problem, base, part, **share) for part in stage}
-        return RolloutImprovement(
-            BeliefEnv(problem.model, problem.start),
-            base,
-            states=PartSampler(generators, self._seed(iteration, "states", number)),
-            frames_per_batch=frames,
-            total_frames=frames,
-            label=label,
+    def _train(
+        self, step: Step, part: int, network: LocalNetwork, local: list[Any], values: list[Any], number: int, name: str
+    ) -> PartRecord:
+        """Train a part's network in place, or load it where an interrupted run has trained it."""
+        path = self.folder / f"{name}.pt" if self.folder is not None else None
+        if path is not None and path.is_file():
+            content = load_tensors(path, self.problem.model.device)
+            network.load_state_dict(content["network"])
+            return PartRecord(**json.loads(content["record"]))
+        improve = isinstance(step, Improve)
+        cache = path.with_suffix(".labels") if path is not None else None
+        make = partial(self._collector, step, part, PartitionedPolicy(local), PartitionedValue(values), number)
+        record = train_part(
+            make,
+            ClassificationLoss(network, self.config.loss) if improve else ValueLoss(network, self._scale),
+            self.config,
+            samples=self.config.samples_per_part if improve else self.config.value_samples,
+            seed=self._seed(number, "batches", part),
+            name=name,
+            cache=cache,
+            logger=self.logger,
             progress=self.progress,
         )
+        if path is not None and cache is not None:
+            save_tensors(path, {"network": network.state_dict(), "record": json.dumps(record.to_dict())})
+            shutil.rmtree(cache, ignore_errors=True)
+        return record
 
-    def _buffers(self, stage: tuple[int, ...], seed: int) -> ReplayBufferEnsemble:
-        """One buffer for each part, written by ``"partition"``; batches come from the parts of the stage alone."""
-        config = self.config
-        parts = range(self.partition.num_parts)
-        members = [
-            TensorDictReplayBuffer(
-                storage=LazyTensorStorage(config.samples_per_part),
-                sampler=SamplerWithoutReplacement(),
-                generator=torch.Generator().manual_seed(seed),
-            )
-            for _ in parts
-        ]
-        return ReplayBufferEnsemble(
-            *members,
-            routing_key="partition",
-            p=[float(part in stage) for part in parts],
-            num_buffer_sampled=len(stage),
-            batch_size=config.batch_size * len(stage),
-            generator=torch.Generator().manual_seed(seed),
+    def _collector(
+        self, step: Step, part: int, policy: PartitionedPolicy, value: PartitionedValue, number: int, **options: Any
+    ) -> RolloutImprovement | PolicyEvaluation:
+        """Collector of the labelled states of a part."""
+        config, problem = self.config, self.problem
+        simulation: dict[str, Any] = {"max_steps": config.max_steps, "seed": self._seed(number, "labels", part)}
+        if step.truncation is not None:
+            simulation |= {"truncation": step.truncation, "terminal_cost": value}
+        states = training_states(problem, self.memory, part, visited_share=config.visited_share)
+        sampler = PartSampler({part: states}, self._seed(number, "states", part))
+        env = BeliefEnv(problem.model, problem.start)
+        if isinstance(step, Evaluate):
+            return PolicyEvaluation(env, policy, states=sampler, label=partial(PolicyCost, **simulation), **options)
+        leaves = {"trajectories": config.trajectories, "leaves": config.leaves, "allocation": config.allocation}
+        label = partial(RolloutPolicy, **leaves, **simulation)
+        return RolloutImprovement(env, policy, states=sampler, label=label, **options)
+
+    def _validate(self, policy: TensorDictModuleBase, name: str) -> torch.Tensor:
+        problem, config = self.problem, self.config
+        return discounted_costs(
+            problem.model,
+            policy,
+            problem.start,
+            num_states=config.validation_states,
+            seed=self._seed(0, "validation"),
+            max_steps=config.max_steps,
+            progress=self.progress,
+            name=f"validate {name}",
         )
 
-
-class _Stepper(DefaultOptimizationStepper):
-    """TorchRL's optimisation step with a falling step size, a log of the losses and a progress bar."""
-
-    def __init__(self, optimizer: torch.optim.Optimizer, steps: int, name: str, logger: Logger | None, progress: bool) -> None:
-        super().__init__()
-        self.schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=steps)
-        self.name, self.logger = name, logger
-        self.bar = tqdm(total=steps, unit="step", desc=f"train {name}", disable=not progress, leave=False)
-        self.count = 0
-
-    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        losses = super().step(trainer, sub_batch)
-        self.schedule.step()
-        self.count += 1
-        if self.logger is not None and self.count % _LOG_INTERVAL == 0:
-            for key in ("loss_policy", "accuracy", "regret"):
-                self.logger.log_scalar(f"{self.name}/{key}", losses[key].item(), step=self.count)
-        self.bar.update()
-        if self.count == self.bar.total:
-            self.bar.close()
-        return losses
+    def _seed(self, iteration: int, purpose: str, part: int = 0) -> int:
+        """A seed for one purpose of one part of one iteration."""
+        return ((self.config.seed * 1000 + iteration) * 100 + part) * len(_PURPOSES) + _PURPOSES.index(purpose)
 
 
-def _store(buffers: ReplayBufferEnsemble, batch: TensorDictBase) -> TensorDictBase:
-    buffers.extend(batch.exclude("collector"))
-    return batch
+def _judge(comparison: Comparison) -> tuple[bool, str]:
+    """Whether a policy is accepted against the best one so far, and why."""
+    low, high = comparison.ratio.interval
+    accepted = high < 1.0
+    verdict = "lower" if accepted else "not lower with confidence"
+    return accepted, (
+        f"cost {verdict}: {comparison.ratio.mean:.4f} ({low:.4f} … {high:.4f}) times that of the best policy so far, "
+        f"on {comparison.ratio.count} validation states"
+    )
 
 
-def _sample(buffers: ReplayBufferEnsemble, batch: TensorDictBase) -> TensorDictBase:
-    return buffers.sample().reshape(-1)
+def _shared_encoder(policy: TensorDictModuleBase) -> Encoder | None:
+    """The encoder of a policy's networks, if it has any."""
+    local = policy.policies if isinstance(policy, PartitionedPolicy) else [policy]
+    return next((p.encoder for p in local if isinstance(p, PolicyNetwork)), None)
 
 
 def _partition(problem: Problem) -> Partition:

@@ -1,0 +1,152 @@
+"""The memory of states that policies visit (paper, Section VI-C): a bounded random sample, part by part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf, take_rows
+from torchrl_pomdp.modules.rollout import Policy, step_noise
+from torchrl_pomdp.noise import fold, uniform
+
+__all__ = ["StateMemory"]
+
+# What a key's independent streams are for.
+_START, _STEPS, _EXPLORE, _CONTROL, _PICK = range(16, 21)
+# Trajectories that are followed at once.
+_BLOCK = 8192
+
+
+class StateMemory:
+    """A random sample of the states that policies have visited, bounded in every part.
+
+    A state is retained with probability ``retain``; of more than ``capacity`` retained states of a part a random subset is
+    kept. What is kept is a function of the seed and of the states alone, not of the order in which they came.
+
+    Args:
+        model: the belief model; without a partition all states are in part 0.
+        capacity: largest number of states of a part.
+        retain: probability that a visited state is retained, in (0, 1]; the paper's is about 0.1.
+        seed: seed of the sample.
+
+    Raises:
+        ValueError: if ``capacity`` is not positive or ``retain`` is not in (0, 1].
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> problem = make_problem("linear20")
+        >>> memory = StateMemory(problem.model, capacity=100)
+        >>> memory.visit(GreedyRepair(problem.model), problem.start, torch.arange(200))
+        >>> memory.count(1), memory.generator(1)(torch.arange(3)).batch_size
+        (100, torch.Size([3]))
+    """
+
+    def __init__(self, model: BeliefModel, capacity: int = 100_000, retain: float = 0.1, seed: int = 0) -> None:
+        if capacity < 1:
+            raise ValueError(f"capacity must be at least 1, got {capacity}")
+        if not 0.0 < retain <= 1.0:
+            raise ValueError(f"retain must be in (0, 1], got {retain}")
+        self.model, self.capacity, self.retain, self.seed = model, capacity, retain, seed
+        parts = 1 if model.partition is None else model.partition.num_parts
+        # For each part the states (core entries) and their priorities, ascending.
+        self._kept: list[tuple[TensorDictBase, Tensor] | None] = [None] * parts
+
+    def count(self, part: int) -> int:
+        """Number of states of a part."""
+        kept = self._kept[part]
+        return 0 if kept is None else kept[1].numel()
+
+    @torch.no_grad()
+    def visit(
+        self, policy: Policy, start: StateGenerator, keys: Tensor, *, exploration: float = 0.0, max_steps: int = 400
+    ) -> None:
+        """Follow a policy from start states and remember what it visits.
+
+        Args:
+            policy: the policy.
+            start: generator of start states.
+            keys: int64 ``[N]``, one for each trajectory.
+
+        Keyword Args:
+            exploration: probability of a random legal control at each step, in [0, 1].
+            max_steps: length at which trajectories are cut.
+
+        Raises:
+            ValueError: if ``exploration`` is not in [0, 1] or ``max_steps`` is not positive.
+        """
+        if not 0.0 <= exploration <= 1.0:
+            raise ValueError(f"exploration must be in [0, 1], got {exploration}")
+        if max_steps < 1:
+            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+        for block in keys.split(_BLOCK):
+            visited: Any = torch.cat([*self._walk(policy, start, block, exploration, max_steps)], 0)
+            self._merge(visited)
+
+    def extend(self, y: TensorDictBase) -> None:
+        """Remember some of the feature states ``y`` ``[N]``."""
+        self._merge(self._retained(self.model.with_features(y, ("partition",))))
+
+    def generator(self, part: int) -> StateGenerator:
+        """Generator of the states of a part that are kept now, all equally likely.
+
+        Raises:
+            ValueError: if there are none.
+        """
+        kept = self._kept[part]
+        if kept is None:
+            raise ValueError(f"the memory holds no state of part {part}")
+        states = kept[0]
+
+        def draw(keys: Tensor) -> TensorDictBase:
+            flat = fold(keys.reshape(-1), _PICK)
+            index = (uniform(flat, 0).double() * states.batch_size[0]).to(torch.int64)
+            return take_rows(states, index).view(keys.shape)
+
+        return draw
+
+    def _walk(
+        self, policy: Policy, start: StateGenerator, keys: Tensor, exploration: float, max_steps: int
+    ) -> Iterator[TensorDictBase]:
+        """The retained states of every step of the trajectories with the given keys."""
+        model = self.model
+        y = model.with_features(start(fold(keys, _START)))
+        for step in range(max_steps):
+            rest = (~model.is_terminal(y)).nonzero().squeeze(-1)
+            if rest.numel() < keys.numel():
+                y, keys = take_rows(y, rest), keys[rest]
+            yield self._retained(y)
+            if keys.numel() == 0:
+                return
+            u = policy(y.copy()).get("action")
+            random = inverse_cdf(y.get("action_mask").to(torch.float32), uniform(fold(keys, _CONTROL), step))
+            u = torch.where(uniform(fold(keys, _EXPLORE), step) < exploration, random, u)
+            _, y = model.advance(y, u, step_noise(fold(keys, _STEPS), step, model.noise_dim))
+
+    def _retained(self, y: TensorDictBase) -> TensorDictBase:
+        """The rows of ``y`` that are retained, with their priority and part."""
+        entries = y.select(*self.model.state_keys)
+        priority = fold(self.model.fingerprint(entries), self.seed)
+        part = y.get("partition") if self.model.partition is not None else torch.zeros_like(priority)
+        rows = (uniform(priority, 0) < self.retain).nonzero().squeeze(-1)
+        return take_rows(entries, rows).update({"priority": priority[rows], "part": part[rows]})
+
+    def _merge(self, y: TensorDictBase) -> None:
+        """Keep, of what is kept and of ``y``, the states of lowest priority; equal states once."""
+        for part, kept in enumerate(self._kept):
+            rows = (y.get("part") == part).nonzero().squeeze(-1)
+            if rows.numel() == 0:
+                continue
+            states: Any = take_rows(y.select(*self.model.state_keys), rows)
+            priority = y.get("priority")[rows]
+            if kept is not None:
+                states, priority = torch.cat([kept[0], states], 0), torch.cat([kept[1], priority])
+            priority, order = priority.sort(stable=True)
+            new = torch.ones_like(priority, dtype=torch.bool)
+            new[1:] = priority.diff() != 0
+            chosen = new.nonzero().squeeze(-1)[: self.capacity]
+            self._kept[part] = take_rows(states, order[chosen]), priority[chosen]

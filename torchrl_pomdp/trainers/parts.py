@@ -1,0 +1,154 @@
+r"""Training one part: label its states with simulations, teach its network, under TorchRL's ``Trainer`` (paper, Section V).
+
+A part's training is a function of the current policies and values, of the configuration and of a seed alone. Parts of one
+stage do not wait for each other and could each have a processor of their own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.objectives import LossModule
+from torchrl.record.loggers import Logger
+from torchrl.trainers import DefaultOptimizationStepper, Trainer
+from tqdm import tqdm
+
+from torchrl_pomdp.collectors import LabelCollector
+from torchrl_pomdp.trainers.config import PolicyIterationConfig
+
+__all__ = ["PartRecord", "train_part"]
+
+_LOG_INTERVAL = 50
+
+
+@dataclass(frozen=True)
+class PartRecord:
+    """What the training of a part took and how it ended.
+
+    Attributes:
+        samples: labelled states.
+        simulated_steps: belief steps of the simulations that labelled them.
+        label_seconds: time of labelling, together with drawing the states.
+        train_seconds: time of optimisation.
+        losses: means of the loss module's outputs over the last tenth of the optimisation steps.
+    """
+
+    samples: int
+    simulated_steps: int
+    label_seconds: float
+    train_seconds: float
+    losses: dict[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """All numbers, for JSON."""
+        return asdict(self)
+
+
+def train_part(
+    make_collector: Callable[..., LabelCollector],
+    loss: LossModule,
+    config: PolicyIterationConfig,
+    *,
+    samples: int,
+    seed: int,
+    name: str,
+    cache: Path | None = None,
+    logger: Logger | None = None,
+    progress: bool = False,
+) -> PartRecord:
+    """Label states and train a loss module's network on them, in place.
+
+    Args:
+        make_collector: makes the collector of labelled states from ``frames_per_batch``, ``total_frames``, ``cache``,
+            ``progress`` and ``name``.
+        loss: loss module of the network that is trained.
+        config: step size, batch size and epochs.
+
+    Keyword Args:
+        samples: labelled states.
+        seed: seed of the batches.
+        name: what logs and progress bars call the part.
+        cache: folder that keeps labels of an interrupted run, see :class:`~torchrl_pomdp.collectors.LabelCollector`.
+        logger: TorchRL logger of the losses.
+        progress: whether to show progress bars.
+    """
+    steps = max(1, config.epochs * samples // config.batch_size)
+    optimizer = torch.optim.RMSprop(loss.parameters(), config.learning_rate)
+    stepper = _Stepper(optimizer, steps, name, logger, progress)
+    collector = make_collector(
+        frames_per_batch=samples, total_frames=samples, cache=cache, progress=progress, name=f"label {name}"
+    )
+    trainer = Trainer(
+        collector=collector,
+        total_frames=samples,
+        frame_skip=1,
+        optim_steps_per_batch=steps,
+        loss_module=loss,
+        optimizer=optimizer,
+        optimization_stepper=stepper,
+        progress_bar=False,
+    )
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(samples),
+        sampler=SamplerWithoutReplacement(),
+        batch_size=min(config.batch_size, samples),
+        generator=torch.Generator().manual_seed(seed),
+    )
+    trainer.register_op("batch_process", partial(_store, buffer))
+    trainer.register_op("process_optim_batch", lambda batch: buffer.sample())
+    try:
+        trainer.train()
+        training = time.perf_counter() - stepper.begin
+    finally:
+        trainer.collector.shutdown()
+    return PartRecord(samples, collector.simulated_steps, collector.seconds, training, stepper.final())
+
+
+class _Stepper(DefaultOptimizationStepper):
+    """TorchRL's optimisation step with a falling step size, a log of the losses and a progress bar."""
+
+    def __init__(self, optimizer: torch.optim.Optimizer, steps: int, name: str, logger: Logger | None, progress: bool) -> None:
+        super().__init__()
+        self.schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=steps)
+        self.name, self.logger, self.steps, self.progress = name, logger, steps, progress
+        self.count, self.begin = 0, 0.0
+        self._sums: dict[str, float] = {}
+
+    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
+        if self.count == 0:
+            self.begin = time.perf_counter()
+            self.bar = tqdm(total=self.steps, unit="step", desc=f"train {self.name}", disable=not self.progress, leave=False)
+        losses = super().step(trainer, sub_batch)
+        self.schedule.step()
+        self.count += 1
+        if self.logger is not None and self.count % _LOG_INTERVAL == 0:
+            for key in trainer.loss_module.out_keys:
+                self.logger.log_scalar(f"{self.name}/{key}", losses[key].item(), step=self.count)
+        if self.count > self.steps - self._tail:
+            for key in trainer.loss_module.out_keys:
+                self._sums[key] = self._sums.get(key, 0.0) + losses[key].item()
+        self.bar.update()
+        if self.count == self.steps:
+            self.bar.close()
+        return losses
+
+    @property
+    def _tail(self) -> int:
+        return max(1, self.steps // 10)
+
+    def final(self) -> dict[str, float]:
+        """Mean losses of the last tenth of the steps."""
+        return {key: total / self._tail for key, total in self._sums.items()}
+
+
+def _store(buffer: TensorDictReplayBuffer, batch: TensorDictBase) -> TensorDictBase:
+    buffer.extend(batch.exclude("collector"))
+    return batch

@@ -1,0 +1,163 @@
+r"""The paper's five algorithms, composed from the library's modules (Section VI-D).
+
+====== ========== ============ =======================================================================
+name   learning   partition    what it is
+====== ========== ============ =======================================================================
+R-NT   none       any          online one-step lookahead, simulations to the end
+R-T    none       any          the same, simulations cut, with a terminal cost
+API    networks   one part     policy iteration, one policy network
+pAPI-NT networks  N parts      policy iteration, N policy networks
+pAPI-T networks   N parts      the same, startgame simulations cut at the endgame, with its value networks
+====== ========== ============ =======================================================================
+
+Online play on top of a trained policy, a Newton step of the method for solving Bellman's equation, is :func:`r_nt` of it,
+or :func:`r_t` with its values.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_pomdp.envs.presets import Problem
+from torchrl_pomdp.modules import AfterSteps, OnEntering, RolloutPolicy, TerminalCost, Truncation
+from torchrl_pomdp.trainers.config import PolicyIterationConfig
+from torchrl_pomdp.trainers.policy_iteration import Evaluate, Improve, PolicyIteration
+
+__all__ = ["api", "papi_nt", "papi_t", "r_nt", "r_t"]
+
+
+def r_nt(problem: Problem, base_policy: TensorDictModuleBase, **options: Any) -> RolloutPolicy:
+    """Rollout without truncation: online, nothing is learnt.
+
+    Args:
+        problem: the problem.
+        base_policy: the base policy.
+        options: see :class:`~torchrl_pomdp.modules.RolloutPolicy`.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> problem = make_problem("line3")
+        >>> r_nt(problem, GreedyRepair(problem.model))(problem.start(torch.arange(2)))["action"].shape
+        torch.Size([2])
+    """
+    return RolloutPolicy(problem.model, base_policy, **options)
+
+
+def r_t(
+    problem: Problem,
+    base_policy: TensorDictModuleBase,
+    terminal_cost: TerminalCost,
+    truncation: Truncation | None = None,
+    **options: Any,
+) -> RolloutPolicy:
+    """Rollout with truncation: online, nothing is learnt.
+
+    Args:
+        problem: the problem.
+        base_policy: the base policy.
+        terminal_cost: cost at the cut.
+        truncation: when simulations are cut; by default after 30 steps.
+        options: see :class:`~torchrl_pomdp.modules.RolloutPolicy`.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import GreedyRepair, SteadyStateCost
+        >>> problem = make_problem("line3")
+        >>> policy = r_t(problem, GreedyRepair(problem.model), SteadyStateCost(problem.model))
+        >>> policy(problem.start(torch.arange(2)))["action"].shape
+        torch.Size([2])
+    """
+    truncation = AfterSteps(30) if truncation is None else truncation
+    return RolloutPolicy(problem.model, base_policy, truncation=truncation, terminal_cost=terminal_cost, **options)
+
+
+def papi_nt(
+    problem: Problem, config: PolicyIterationConfig, base_policy: TensorDictModuleBase, **options: Any
+) -> PolicyIteration:
+    """Partitioned policy iteration without truncation; the partition's stages one after the other.
+
+    Args:
+        problem: the problem.
+        config: the numbers.
+        base_policy: the policy that is improved first.
+        options: see :class:`PolicyIteration`.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import UrgencyRepair
+        >>> problem = make_problem("linear20")
+        >>> [step.parts for step in papi_nt(problem, PolicyIterationConfig(), UrgencyRepair(problem.model)).plan]
+        [(3, 4, 5), (0, 1, 2)]
+    """
+    stages = problem.model.partition.stages if problem.model.partition is not None else ()
+    return PolicyIteration(problem, config, base_policy, [Improve(stage) for stage in stages], **options)
+
+
+def papi_t(
+    problem: Problem, config: PolicyIterationConfig, base_policy: TensorDictModuleBase, **options: Any
+) -> PolicyIteration:
+    r"""Partitioned policy iteration with truncation: simulations from a later stage end where they enter an earlier one.
+
+    There :math:`\alpha^m\hat J` of that part's value network is added. Every stage but the last has value networks.
+
+    Args:
+        problem: the problem; its partition has at least two stages.
+        config: the numbers.
+        base_policy: the policy that is improved first.
+        options: see :class:`PolicyIteration`.
+
+    Raises:
+        ValueError: if the partition has one stage alone.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import UrgencyRepair
+        >>> problem = make_problem("linear20")
+        >>> plan = papi_t(problem, PolicyIterationConfig(), UrgencyRepair(problem.model)).plan
+        >>> [(type(step).__name__, step.parts) for step in plan]
+        [('Improve', (3, 4, 5)), ('Evaluate', (3, 4, 5)), ('Improve', (0, 1, 2))]
+    """
+    stages = problem.model.partition.stages if problem.model.partition is not None else ()
+    if len(stages) < 2:
+        raise ValueError(f"pAPI-T needs a partition of at least two stages, problem {problem.name!r} has {len(stages)}")
+    plan: list[Improve | Evaluate] = []
+    entered: tuple[int, ...] = ()
+    for stage in stages:
+        plan.append(Improve(stage, OnEntering(entered) if entered else None))
+        if stage is not stages[-1]:
+            plan.append(Evaluate(stage, OnEntering(entered) if entered else None))
+        entered += stage
+    return PolicyIteration(problem, config, base_policy, plan, **options)
+
+
+def api(
+    problem: Problem, config: PolicyIterationConfig, base_policy: TensorDictModuleBase, **options: Any
+) -> PolicyIteration:
+    """Policy iteration with one network for the whole feature space; the problem must have a single part.
+
+    Args:
+        problem: the problem, ``make_problem(name, partitioned=False)``.
+        config: the numbers; ``samples_per_part`` is then the number of all samples.
+        base_policy: the policy that is improved first.
+        options: see :class:`PolicyIteration`.
+
+    Raises:
+        ValueError: if the problem has several parts.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import UrgencyRepair
+        >>> problem = make_problem("linear20", partitioned=False)
+        >>> [step.parts for step in api(problem, PolicyIterationConfig(), UrgencyRepair(problem.model)).plan]
+        [(0,)]
+    """
+    partition = problem.model.partition
+    if partition is None or partition.num_parts != 1:
+        parts = 0 if partition is None else partition.num_parts
+        raise ValueError(f"API is for a problem with a single part, {problem.name!r} has {parts}: make it with partitioned=False")
+    return PolicyIteration(problem, config, base_policy, [Improve((0,))], **options)
