@@ -5,11 +5,15 @@ from torchrl_pomdp.modules.lookahead import RolloutPolicy
 from torchrl_pomdp.modules.networks import Encoder, FlatEncoder, PolicyNetwork, RelativeEncoder
 from torchrl_pomdp.modules.partitioned import PartitionedPolicy
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.truncation import AfterSteps, OnEntering, OnLeaving, Truncation
 
 __all__ = [
+    "AfterSteps",
     "Encoder",
     "FlatEncoder",
     "GreedyRepair",
+    "OnEntering",
+    "OnLeaving",
     "PartitionedPolicy",
     "Policy",
     "PolicyNetwork",
@@ -17,4 +21,5 @@ __all__ = [
     "RolloutPolicy",
     "TerminalCost",
     "TruncatedRollout",
+    "Truncation",
 ]
