@@ -111,7 +111,7 @@ def fingerprint(y: TensorDictBase) -> Tensor:
         if leaf.is_floating_point():
             # Adding zero turns -0.0, which compares equal to 0.0, into 0.0.
             leaf = (leaf + 0.0).contiguous().view(torch.int64 if leaf.dtype == torch.float64 else torch.int32)
-        bits = leaf.reshape(*y.batch_size, -1).to(torch.int64)
+        bits = leaf.reshape(*y.batch_size, leaf.shape[y.ndim :].numel()).to(torch.int64)
         index = torch.arange(offset, offset + bits.shape[-1], device=bits.device)
         total = total + (bits * (_mix(index + 1) | 1)).sum(-1)
         offset += bits.shape[-1]

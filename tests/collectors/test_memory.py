@@ -32,12 +32,14 @@ def test_it_holds_the_states_of_the_policys_trajectories(line3):
             steps = env.rollout(12, greedy, break_when_any_done=False)
         steps = steps[~steps["terminated"].squeeze(-1)]
         seen |= set(model.fingerprint(steps).tolist())
-    for part in range(6):
+    parts = [part for part in range(6) if memory.count(part)]
+    assert len(parts) >= 4
+    for part in parts:
         states = memory.generator(part)(torch.arange(300))
         assert (model.partition(states) == part).all()
         assert not model.is_terminal(states).any()
     # From an enumerable start both ways of playing meet nearly the same early states.
-    first = {f for part in range(6) for f in held(memory, part)}
+    first = {f for part in parts for f in held(memory, part)}
     assert len(first & seen) > 0.5 * len(seen)
 
 
@@ -59,7 +61,7 @@ def test_the_order_of_visits_does_not_matter(linear20):
     for keys in reversed(torch.arange(200).split(30)):
         parts.visit(greedy, linear20.start, keys)
     parts.visit(greedy, linear20.start, torch.arange(50))
-    assert all(held(whole, part) == held(parts, part) for part in range(6))
+    assert all(held(whole, part) == held(parts, part) for part in range(6) if whole.count(part) or parts.count(part))
 
 
 def test_exploration_leaves_the_policys_trajectories(linear20):

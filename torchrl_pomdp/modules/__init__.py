@@ -6,19 +6,30 @@ from torchrl_pomdp.modules.lookahead import RolloutPolicy
 from torchrl_pomdp.modules.networks import PolicyNetwork, ValueNetwork
 from torchrl_pomdp.modules.partitioned import PartitionedPolicy, PartitionedValue
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, NeverRepairCost, PolicyCost, SteadyStateCost, ZeroCost
+from torchrl_pomdp.modules.truncation import AfterSteps, OnEntering, OnLeaving, Truncation
 
 __all__ = [
+    "AfterSteps",
+    "ClosedFormCost",
     "Encoder",
     "FlatEncoder",
     "GreedyRepair",
+    "NeverRepairCost",
+    "OnEntering",
+    "OnLeaving",
     "PartitionedPolicy",
     "PartitionedValue",
     "Policy",
+    "PolicyCost",
     "PolicyNetwork",
     "RelativeEncoder",
     "RolloutPolicy",
+    "SteadyStateCost",
     "TerminalCost",
     "TruncatedRollout",
+    "Truncation",
     "UrgencyRepair",
     "ValueNetwork",
+    "ZeroCost",
 ]

@@ -13,6 +13,7 @@ from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf, take_rows
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.threads import map_threads
+from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold, uniform
 
 __all__ = ["RolloutPolicy"]
@@ -45,7 +46,8 @@ class RolloutPolicy(TensorDictModuleBase):
         allocation: ``"uniform"``: every control gets all trajectories. ``"adaptive"``: they are spent in rounds, and a control
             that the best one clearly beats, by the differences of their paired trajectories, gets no more; a state whose
             decision is settled costs nothing further.
-        max_steps: m, see :class:`TruncatedRollout`.
+        max_steps: largest m, see :class:`TruncatedRollout`.
+        truncation: state-dependent m, see :class:`TruncatedRollout`.
         terminal_cost: :math:`\hat J`, see :class:`TruncatedRollout`.
         seed: seed of the simulations.
         chunk_rows: see :class:`TruncatedRollout`; on a CPU each of ``torch.get_num_threads()`` threads has such a chunk.
@@ -76,6 +78,7 @@ class RolloutPolicy(TensorDictModuleBase):
         leaves: Literal["control", "observation"] = "control",
         allocation: Literal["uniform", "adaptive"] = "uniform",
         max_steps: int = 400,
+        truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
         seed: int = 0,
         chunk_rows: int = 16384,
@@ -93,11 +96,17 @@ class RolloutPolicy(TensorDictModuleBase):
             model,
             base_policy,
             max_steps=max_steps,
+            truncation=truncation,
             terminal_cost=terminal_cost,
             chunk_rows=chunk_rows,
             compile=compile,
         )
         self.trajectories, self.leaves, self.allocation, self.seed = trajectories, leaves, allocation, seed
+
+    @property
+    def simulated_steps(self) -> int:
+        """Belief steps simulated so far."""
+        return self.cost_to_go.simulated_steps
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"q_factors"`` ``[*B, U]`` (costs, ``+inf`` where illegal) and ``"action"`` ``[*B]`` (ties to the lower)."""

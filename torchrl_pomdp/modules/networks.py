@@ -3,7 +3,7 @@ r"""Policy and value networks, :math:`\hat\mu(y,r)` and :math:`\hat J(y,r)` (pap
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import cast
 
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from torchrl_pomdp.envs.belief import take_rows
 from torchrl_pomdp.modules.encoders import Encoder, rowwise
+from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
 
 __all__ = ["LocalNetwork", "PolicyNetwork", "ValueNetwork", "evaluate_networks", "invert"]
 
@@ -93,15 +94,15 @@ class ValueNetwork(LocalNetwork):
 
     Args:
         encoder: encoder of feature states.
-        scale: positive costs ``[*B]`` of feature states ``[*B]`` from the encoder's entries.
+        scale: positive cost of a state.
         hidden: sizes of the hidden layers.
         generator: generator of the initial weights; the global one is left alone.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import FlatEncoder
+        >>> from torchrl_pomdp.modules import FlatEncoder, NeverRepairCost
         >>> problem = make_problem("linear20")
-        >>> scale = lambda y: problem.model.expected_cost(y) + 1
+        >>> scale = NeverRepairCost(problem.model)
         >>> network = ValueNetwork(FlatEncoder(problem.model), scale, generator=torch.Generator().manual_seed(0))
         >>> network(problem.start(torch.arange(6)))["state_value"].shape
         torch.Size([6])
@@ -112,7 +113,7 @@ class ValueNetwork(LocalNetwork):
     def __init__(
         self,
         encoder: Encoder,
-        scale: Callable[[TensorDictBase], Tensor],
+        scale: ClosedFormCost,
         hidden: Sequence[int] = (256, 128, 64),
         *,
         generator: torch.Generator,
@@ -123,7 +124,7 @@ class ValueNetwork(LocalNetwork):
 
     def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
         """``"state_value"``; see the class."""
-        return TensorDict({"state_value": output.squeeze(-1) * self.scale(y)}, y.batch_size)
+        return TensorDict({"state_value": output.squeeze(-1) * self.scale.costs(y)}, y.batch_size)
 
 
 def evaluate_networks(

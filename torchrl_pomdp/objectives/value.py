@@ -2,14 +2,14 @@ r"""Training a value network on simulated costs is a regression problem (paper, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
-from torch import Tensor
 from torchrl.objectives import LossModule
+
+from torchrl_pomdp.modules import ClosedFormCost
 
 __all__ = ["ValueLoss"]
 
@@ -22,7 +22,7 @@ class ValueLoss(LossModule):
 
     Args:
         value: module that writes ``"state_value"``; a :class:`~torchrl_pomdp.modules.ValueNetwork` or a partitioned one.
-        scale: positive costs ``[*B]`` of feature states ``[*B]`` that errors are divided by.
+        scale: positive cost of a state that its error is divided by.
 
     Returns (by ``forward``):
         TensorDict with scalars ``loss_value`` and ``relative_error`` (mean absolute error over mean target).
@@ -50,7 +50,7 @@ class ValueLoss(LossModule):
     value_params: TensorDictParams
     target_value_params: TensorDictParams
 
-    def __init__(self, value: TensorDictModuleBase, scale: Callable[[TensorDictBase], Tensor]) -> None:
+    def __init__(self, value: TensorDictModuleBase, scale: ClosedFormCost) -> None:
         super().__init__()
         self._in_keys: list[NestedKey] | None = None
         self.scale = scale
@@ -76,7 +76,7 @@ class ValueLoss(LossModule):
             value = self.value(batch.select(*self.value.in_keys)).get("state_value")
         target = batch.get(self.tensor_keys.cost_to_go)
         error = value - target
-        relative = error / self.scale(batch)
+        relative = error / self.scale.costs(batch)
         return TensorDict(
             {
                 "loss_value": relative.square().mean(),

@@ -124,7 +124,7 @@ def load_checkpoint(path: Path, *, device: torch.device | str = "cpu") -> Checkp
         problem = make_problem(about["problem"], partitioned=about["partitioned"], device=device)
         policy = make_networks(problem, config, seed=0)
         policy.load_state_dict(content["policy"])
-        networks = make_values(problem, config, 0, policy.policies[0].encoder).values
+        networks = make_values(problem, config, seed=0).values
         closed_form = NeverRepairCost(problem.model)
         trained = about["value_parts"]
         value = PartitionedValue([v if part in trained else closed_form for part, v in enumerate(networks)])

@@ -58,6 +58,9 @@ class PolicyIterationConfig:
     memory_capacity: int = 100_000
     """Largest number of states of a part in the memory."""
 
+    symmetries: bool = True
+    """Whether mirror images of labelled states are labelled states too."""
+
     encoder: Literal["relative", "flat"] = "relative"
     """Network input: beliefs at offsets from the robot, or the flattened beliefs and one-hot location of the paper."""
 

@@ -1,16 +1,11 @@
-r"""Training one part: label its states with simulations, teach its network, under TorchRL's ``Trainer`` (paper, Section V).
-
-A part's training is a function of the current policies and values, of the configuration and of a seed alone. Parts of one
-stage do not wait for each other and could each have a processor of their own.
-"""
+r"""Teaching the network of one part, under TorchRL's ``Trainer`` (paper, Sections IV and V)."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,7 +16,6 @@ from torchrl.record.loggers import Logger
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 from tqdm import tqdm
 
-from torchrl_pomdp.collectors import LabelCollector
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 
 __all__ = ["PartRecord", "train_part"]
@@ -34,7 +28,7 @@ class PartRecord:
     """What the training of a part took and how it ended.
 
     Attributes:
-        samples: labelled states.
+        samples: labelled states; each is used with all its mirror images that lie in the part.
         simulated_steps: belief steps of the simulations that labelled them.
         label_seconds: time of labelling, together with drawing the states.
         train_seconds: time of optimisation.
@@ -53,42 +47,38 @@ class PartRecord:
 
 
 def train_part(
-    make_collector: Callable[..., LabelCollector],
+    batch: TensorDictBase,
     loss: LossModule,
     config: PolicyIterationConfig,
     *,
-    samples: int,
     seed: int,
     name: str,
-    cache: Path | None = None,
     logger: Logger | None = None,
     progress: bool = False,
-) -> PartRecord:
-    """Label states and train a loss module's network on them, in place.
+) -> tuple[float, dict[str, float]]:
+    """Train a loss module's network on labelled states, in place.
 
     Args:
-        make_collector: makes the collector of labelled states from ``frames_per_batch``, ``total_frames``, ``cache``,
-            ``progress`` and ``name``.
+        batch: labelled states ``[N]``, from a :class:`~torchrl_pomdp.collectors.LabelCollector`.
         loss: loss module of the network that is trained.
         config: step size, batch size and epochs.
 
     Keyword Args:
-        samples: labelled states.
         seed: seed of the batches.
         name: what logs and progress bars call the part.
-        cache: folder that keeps labels of an interrupted run, see :class:`~torchrl_pomdp.collectors.LabelCollector`.
         logger: TorchRL logger of the losses.
-        progress: whether to show progress bars.
+        progress: whether to show a progress bar.
+
+    Returns:
+        seconds, and the means of the loss module's outputs over the last tenth of the optimisation steps.
     """
-    steps = max(1, config.epochs * samples // config.batch_size)
+    size = batch.batch_size.numel()
+    steps = max(1, config.epochs * size // config.batch_size)
     optimizer = torch.optim.RMSprop(loss.parameters(), config.learning_rate)
     stepper = _Stepper(optimizer, steps, name, logger, progress)
-    collector = make_collector(
-        frames_per_batch=samples, total_frames=samples, cache=cache, progress=progress, name=f"label {name}"
-    )
     trainer = Trainer(
-        collector=collector,
-        total_frames=samples,
+        collector=_Labelled(batch),
+        total_frames=size,
         frame_skip=1,
         optim_steps_per_batch=steps,
         loss_module=loss,
@@ -97,19 +87,34 @@ def train_part(
         progress_bar=False,
     )
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(samples),
+        storage=LazyTensorStorage(size),
         sampler=SamplerWithoutReplacement(),
-        batch_size=min(config.batch_size, samples),
+        batch_size=min(config.batch_size, size),
         generator=torch.Generator().manual_seed(seed),
     )
     trainer.register_op("batch_process", partial(_store, buffer))
     trainer.register_op("process_optim_batch", lambda batch: buffer.sample())
-    try:
-        trainer.train()
-        training = time.perf_counter() - stepper.begin
-    finally:
-        trainer.collector.shutdown()
-    return PartRecord(samples, collector.simulated_steps, collector.seconds, training, stepper.final())
+    begin = time.perf_counter()
+    trainer.train()
+    return time.perf_counter() - begin, stepper.final()
+
+
+class _Labelled:
+    """Labelled states as a ``Trainer`` takes them: a collector of a single batch."""
+
+    init_random_frames = 0
+
+    def __init__(self, batch: TensorDictBase) -> None:
+        self.batch = batch
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        yield self.batch
+
+    def set_seed(self, seed: int, static_seed: bool = False) -> int:
+        return seed
+
+    def shutdown(self) -> None:
+        pass
 
 
 class _Stepper(DefaultOptimizationStepper):
@@ -119,12 +124,11 @@ class _Stepper(DefaultOptimizationStepper):
         super().__init__()
         self.schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, total_iters=steps)
         self.name, self.logger, self.steps, self.progress = name, logger, steps, progress
-        self.count, self.begin = 0, 0.0
+        self.count = 0
         self._sums: dict[str, float] = {}
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         if self.count == 0:
-            self.begin = time.perf_counter()
             self.bar = tqdm(total=self.steps, unit="step", desc=f"train {self.name}", disable=not self.progress, leave=False)
         losses = super().step(trainer, sub_batch)
         self.schedule.step()

@@ -16,9 +16,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.record.loggers import Logger
 
@@ -26,6 +27,7 @@ from torchrl_pomdp.collectors import PartSampler, PolicyEvaluation, RolloutImpro
 from torchrl_pomdp.envs.belief import BeliefEnv
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.presets import Problem
+from torchrl_pomdp.envs.symmetry import symmetries
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import load_tensors, save_tensors
 from torchrl_pomdp.modules import (
@@ -106,7 +108,9 @@ class Iteration:
     records: dict[str, PartRecord] = field(repr=False)
 
 
-def make_networks(problem: Problem, config: PolicyIterationConfig, seed: int, encoder: Encoder | None = None) -> PartitionedPolicy:
+def make_networks(
+    problem: Problem, config: PolicyIterationConfig, seed: int, encoder: Encoder | None = None
+) -> PartitionedPolicy:
     """An untrained partitioned policy: one policy network for each part of the problem's partition.
 
     Args:
@@ -124,9 +128,7 @@ def make_networks(problem: Problem, config: PolicyIterationConfig, seed: int, en
     generator = torch.Generator(device=model.device).manual_seed(seed)
     encoder = encoder or _ENCODERS[config.encoder](model)
     parts = range(_partition(problem).num_parts)
-    return PartitionedPolicy(
-        [PolicyNetwork(encoder, model.num_controls, config.hidden, generator=generator) for _ in parts]
-    )
+    return PartitionedPolicy([PolicyNetwork(encoder, model.num_controls, config.hidden, generator=generator) for _ in parts])
 
 
 def make_values(problem: Problem, config: PolicyIterationConfig, seed: int, encoder: Encoder | None = None) -> PartitionedValue:
@@ -204,6 +206,7 @@ class PolicyIteration:
         self.best: TensorDictModuleBase = base_policy
         self.memory = StateMemory(problem.model, config.memory_capacity, seed=self._seed(0, "visits"))
         self._scale = NeverRepairCost(problem.model)
+        self._symmetries = symmetries(problem.model)[: None if config.symmetries else 1]
         self._values: list[TensorDictModuleBase] = [self._scale] * self.partition.num_parts
         self._encoder = _shared_encoder(base_policy) or _ENCODERS[config.encoder](problem.model)
 
@@ -225,15 +228,15 @@ class PolicyIteration:
         """The local policies and values after one iteration from the best policy."""
         config, best = self.config, self.best
         local = list(best.policies) if isinstance(best, PartitionedPolicy) else [best] * self.partition.num_parts
-        values, records = list(self._values), {}
+        values: list[Any] = list(self._values)
+        records: dict[str, PartRecord] = {}
         keys = seed_keys(self._seed(number, "visits"), torch.arange(config.visits, device=self.problem.model.device))
         self.memory.visit(PartitionedPolicy(local), self.problem.start, keys, exploration=config.exploration)
         for index, step in enumerate(self.plan):
-            networks = {}
-            for part in step.parts:
-                name = f"iteration-{number}/{index + 1}-{type(step).__name__.lower()}-part-{part}"
-                networks[part] = self._initial(step, part, local, values, number)
-                records[name] = self._train(step, part, networks[part], local, values, number, name)
+            name = f"iteration-{number}/{index + 1}-{type(step).__name__.lower()}"
+            networks = {part: self._initial(step, part, local, values, number) for part in step.parts}
+            trained = self._restore(networks, name)
+            records |= trained or self._train_step(step, networks, local, values, number, name)
             for part, network in networks.items():
                 (local if isinstance(step, Improve) else values)[part] = network.eval()
         return local, values, records
@@ -242,57 +245,92 @@ class PolicyIteration:
         """The network to train: the one that the part has, or a new one."""
         old = (local if isinstance(step, Improve) else values)[part]
         if isinstance(old, LocalNetwork):
-            # The encoder has no weights; shared, it lets networks be evaluated together.
-            return copy.deepcopy(old, {id(old.encoder): old.encoder})
+            # What has no weights is shared; a shared encoder lets networks be evaluated together.
+            return copy.deepcopy(old, {id(old.encoder): old.encoder, id(self._scale): self._scale})
         seed = self._seed(number, "weights", part)
         if isinstance(step, Improve):
-            return make_networks(self.problem, self.config, seed, self._encoder).policies[part]
-        return make_values(self.problem, self.config, seed, self._encoder).values[part]
+            return cast(LocalNetwork, make_networks(self.problem, self.config, seed, self._encoder).policies[part])
+        return cast(LocalNetwork, make_values(self.problem, self.config, seed, self._encoder).values[part])
 
-    def _train(
-        self, step: Step, part: int, network: LocalNetwork, local: list[Any], values: list[Any], number: int, name: str
-    ) -> PartRecord:
-        """Train a part's network in place, or load it where an interrupted run has trained it."""
-        path = self.folder / f"{name}.pt" if self.folder is not None else None
-        if path is not None and path.is_file():
-            content = load_tensors(path, self.problem.model.device)
-            network.load_state_dict(content["network"])
-            return PartRecord(**json.loads(content["record"]))
-        improve = isinstance(step, Improve)
-        cache = path.with_suffix(".labels") if path is not None else None
-        make = partial(self._collector, step, part, PartitionedPolicy(local), PartitionedValue(values), number)
-        record = train_part(
-            make,
-            ClassificationLoss(network, self.config.loss) if improve else ValueLoss(network, self._scale),
-            self.config,
-            samples=self.config.samples_per_part if improve else self.config.value_samples,
-            seed=self._seed(number, "batches", part),
-            name=name,
-            cache=cache,
-            logger=self.logger,
-            progress=self.progress,
-        )
-        if path is not None and cache is not None:
-            save_tensors(path, {"network": network.state_dict(), "record": json.dumps(record.to_dict())})
+    def _restore(self, networks: dict[int, LocalNetwork], name: str) -> dict[str, PartRecord] | None:
+        """Load the networks of a step where an interrupted run has trained them; None where it has not."""
+        if self.folder is None or not (self.folder / f"{name}.pt").is_file():
+            return None
+        content = load_tensors(self.folder / f"{name}.pt", self.problem.model.device)
+        for part, network in networks.items():
+            network.load_state_dict(content["networks"][str(part)])
+        return {key: PartRecord(**record) for key, record in json.loads(content["records"]).items()}
+
+    def _train_step(
+        self, step: Step, networks: dict[int, LocalNetwork], local: list[Any], values: list[Any], number: int, name: str
+    ) -> dict[str, PartRecord]:
+        """Label states of the step's parts, train their networks in place, and keep them."""
+        cache = self.folder / f"{name}.labels" if self.folder is not None else None
+        make = partial(self._collector, step, PartitionedPolicy(local), PartitionedValue(values), number, cache)
+        collectors = {part: make(part) for part in step.parts}
+        labelled: dict[int, Any] = {part: next(iter(collector)) for part, collector in collectors.items()}
+        images = self._images(labelled)
+        records = {}
+        for part, network in networks.items():
+            seconds, losses = train_part(
+                images[part],
+                ClassificationLoss(network, self.config.loss) if isinstance(step, Improve) else ValueLoss(network, self._scale),
+                self.config,
+                seed=self._seed(number, "batches", part),
+                name=f"{name}-part-{part}",
+                logger=self.logger,
+                progress=self.progress,
+            )
+            collector = collectors[part]
+            records[f"{name}-part-{part}"] = PartRecord(
+                labelled[part].shape[0], collector.simulated_steps, collector.seconds, seconds, losses
+            )
+        if self.folder is not None and cache is not None:
+            states = {str(part): network.state_dict() for part, network in networks.items()}
+            content = {"networks": states, "records": json.dumps({key: r.to_dict() for key, r in records.items()})}
+            save_tensors(self.folder / f"{name}.pt", content)
             shutil.rmtree(cache, ignore_errors=True)
-        return record
+        return records
+
+    def _images(self, labelled: dict[int, Any]) -> dict[int, TensorDictBase]:
+        """For every part, the labelled states and mirror images of labelled states that lie in it."""
+        images: dict[int, list[Any]] = {part: [] for part in labelled}
+        for batch in labelled.values():
+            for symmetry in self._symmetries:
+                image = symmetry(batch.exclude("collector"))
+                for part, found in images.items():
+                    found.append(image[image.get("partition") == part])
+        return {part: cast(TensorDictBase, torch.cat(found)) for part, found in images.items()}
 
     def _collector(
-        self, step: Step, part: int, policy: PartitionedPolicy, value: PartitionedValue, number: int, **options: Any
+        self,
+        step: Step,
+        policy: PartitionedPolicy,
+        value: PartitionedValue,
+        number: int,
+        cache: Path | None,
+        part: int,
     ) -> RolloutImprovement | PolicyEvaluation:
-        """Collector of the labelled states of a part."""
+        """Collector of the labelled states of a part, all in one batch."""
         config, problem = self.config, self.problem
         simulation: dict[str, Any] = {"max_steps": config.max_steps, "seed": self._seed(number, "labels", part)}
         if step.truncation is not None:
             simulation |= {"truncation": step.truncation, "terminal_cost": value}
         states = training_states(problem, self.memory, part, visited_share=config.visited_share)
-        sampler = PartSampler({part: states}, self._seed(number, "states", part))
+        samples = config.samples_per_part if isinstance(step, Improve) else config.value_samples
+        options: dict[str, Any] = {
+            "states": PartSampler({part: states}, self._seed(number, "states", part)),
+            "frames_per_batch": samples,
+            "total_frames": samples,
+            "cache": cache / str(part) if cache is not None else None,
+            "progress": self.progress,
+            "name": f"label {type(step).__name__.lower()} part {part}",
+        }
         env = BeliefEnv(problem.model, problem.start)
         if isinstance(step, Evaluate):
-            return PolicyEvaluation(env, policy, states=sampler, label=partial(PolicyCost, **simulation), **options)
-        leaves = {"trajectories": config.trajectories, "leaves": config.leaves, "allocation": config.allocation}
-        label = partial(RolloutPolicy, **leaves, **simulation)
-        return RolloutImprovement(env, policy, states=sampler, label=label, **options)
+            return PolicyEvaluation(env, policy, label=partial(PolicyCost, **simulation), **options)
+        simulation |= {"trajectories": config.trajectories, "leaves": config.leaves, "allocation": config.allocation}
+        return RolloutImprovement(env, policy, label=partial(RolloutPolicy, **simulation), **options)
 
     def _validate(self, policy: TensorDictModuleBase, name: str) -> torch.Tensor:
         problem, config = self.problem, self.config

@@ -135,9 +135,7 @@ def papi_t(
     return PolicyIteration(problem, config, base_policy, plan, **options)
 
 
-def api(
-    problem: Problem, config: PolicyIterationConfig, base_policy: TensorDictModuleBase, **options: Any
-) -> PolicyIteration:
+def api(problem: Problem, config: PolicyIterationConfig, base_policy: TensorDictModuleBase, **options: Any) -> PolicyIteration:
     """Policy iteration with one network for the whole feature space; the problem must have a single part.
 
     Args:
@@ -159,5 +157,7 @@ def api(
     partition = problem.model.partition
     if partition is None or partition.num_parts != 1:
         parts = 0 if partition is None else partition.num_parts
-        raise ValueError(f"API is for a problem with a single part, {problem.name!r} has {parts}: make it with partitioned=False")
+        raise ValueError(
+            f"API is for a problem with a single part, {problem.name!r} has {parts}: make it with partitioned=False"
+        )
     return PolicyIteration(problem, config, base_policy, [Improve((0,))], **options)

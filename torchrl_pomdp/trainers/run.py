@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -122,12 +121,11 @@ class _Execution:
         training = ALGORITHMS[run.algorithm](
             self.problem, config, bases[run.base], folder=self.folder, logger=logger, progress=self.progress
         )
-        best, summaries = run.base, []
+        best: str = run.base
+        summaries = []
         for iteration in training:
             name = f"{run.algorithm} {iteration.number}"
-            checkpoint = Checkpoint(
-                self.problem, config, run.algorithm, iteration.number, iteration.policy, iteration.value
-            )
+            checkpoint = Checkpoint(self.problem, config, run.algorithm, iteration.number, iteration.policy, iteration.value)
             save_checkpoint(self.folder / f"iteration-{iteration.number}.pt", checkpoint)
             if iteration.accepted:
                 save_checkpoint(self.folder / "best.pt", checkpoint)

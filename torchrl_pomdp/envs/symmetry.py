@@ -1,0 +1,109 @@
+"""Symmetries of the repair problem: what a label says of one state it says of every mirror image of that state.
+
+Reflections and rotations of a line or grid, and exchanges of robots, change neither costs nor probabilities. Every labelled
+state therefore stands for several, which is the cheapest way to more training data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_pomdp.envs.graphs import Graph
+from torchrl_pomdp.envs.repair import RepairModel
+
+__all__ = ["Symmetry", "symmetries"]
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """A renaming of locations, controls and robots under which the model stays what it is.
+
+    Attributes:
+        model: the repair model.
+        locations: int64 ``[L]``; the new name of every location.
+        controls: int64 ``[U]``; the new name of every joint control.
+        robots: int64 ``[R]``; which robot takes the place of the first, the second, ...
+    """
+
+    model: RepairModel
+    locations: Tensor
+    controls: Tensor
+    robots: Tensor
+
+    def __call__(self, y: TensorDictBase) -> TensorDictBase:
+        """The images of feature states and labels ``[*B]``; entries that it does not know are the same for the image.
+
+        Args:
+            y: ``belief`` and ``location``, and any of ``action_mask``, ``partition``, ``action`` and ``q_factors``.
+        """
+        image, keys = y.copy(), set(y.keys())
+        back = self.locations.argsort()
+        image.set("belief", y.get("belief").index_select(-2, back))
+        image.set("location", self.locations[y.get("location").index_select(-1, self.robots)])
+        if "action" in keys:
+            image.set("action", self.controls[y.get("action")])
+        for key in ("action_mask", "q_factors"):
+            if key in keys:
+                image.set(key, y.get(key).index_select(-1, self.controls.argsort()))
+        if self.model.partition is not None and "partition" in keys:
+            image.set("partition", self.model.partition(image))
+        return image
+
+
+def symmetries(model: RepairModel) -> list[Symmetry]:
+    """All symmetries of a repair model that its graph's columns and rows show, the identity first.
+
+    Args:
+        model: the repair model.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> [len(symmetries(make_problem(name).model)) for name in ("linear20", "grid5x4", "grid6x6", "two_robots20")]
+        [2, 4, 8, 4]
+    """
+    found = []
+    for locations, slots in _graph_symmetries(model.graph):
+        controls = torch.tensor([0, *(1 + slot for slot in slots)])
+        for order in permutations(range(model.num_robots)):
+            robots = torch.tensor(order, device=model.device)
+            every = model.split_controls(torch.arange(model.num_controls, device=model.device))
+            joint = model.join_controls(controls.to(model.device)[every[:, robots]])
+            found.append(Symmetry(model, torch.tensor(locations, device=model.device), joint, robots))
+    return found
+
+
+def _graph_symmetries(graph: Graph) -> Iterator[tuple[list[int], list[int]]]:
+    """New names of locations and of slots under the reflections and rotations that map the graph to itself."""
+    columns, rows = graph.columns.tolist(), graph.rows.tolist()
+    places = list(zip(columns, rows, strict=True))
+    seen = set()
+    for turn, across, down in product((False, True), repeat=3):
+        renamed = []
+        for column, row in places:
+            c, r = (row, column) if turn else (column, row)
+            wide, high = (rows, columns) if turn else (columns, rows)
+            image = (max(wide) + min(wide) - c if across else c, max(high) + min(high) - r if down else r)
+            renamed.append(places.index(image) if image in places else -1)
+        slots = _slot_names(graph, renamed) if -1 not in renamed and len(set(renamed)) == len(renamed) else None
+        if slots is not None and tuple(renamed) not in seen:
+            seen.add(tuple(renamed))
+            yield renamed, slots
+
+
+def _slot_names(graph: Graph, renamed: list[int]) -> list[int] | None:
+    """New names of the slots if locations are renamed, or None where no renaming of slots keeps the graph."""
+    table = graph.neighbours.tolist()
+    for slots in permutations(range(len(graph.slot_names))):
+        if all(
+            table[renamed[node]][slots[slot]] == (renamed[to] if to >= 0 else -1)
+            for node, row in enumerate(table)
+            for slot, to in enumerate(row)
+        ):
+            return list(slots)
+    return None
