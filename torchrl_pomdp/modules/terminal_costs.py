@@ -1,0 +1,179 @@
+r"""Terminal cost approximations :math:`\hat J` for truncated rollout (paper, Section III)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from torchrl_pomdp.envs.belief import BeliefModel, take_rows
+from torchrl_pomdp.envs.partition import location_costs
+from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.threads import map_threads
+from torchrl_pomdp.modules.truncation import Truncation
+from torchrl_pomdp.noise import fold
+
+__all__ = ["NeverRepairCost", "PolicyCost", "SteadyStateCost", "ZeroCost"]
+
+# Trajectories that are made at once, in chunks of the rollout: enough to keep its chunk full nearly all the time.
+_CHUNKS_PER_BLOCK = 4
+
+
+class ZeroCost(nn.Module):
+    r""":math:`\hat J=0`: what follows a cut is left out, on purpose.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> ZeroCost()(make_problem("line3").start(torch.arange(2))).tolist()
+        [0.0, 0.0]
+    """
+
+    in_keys = ["belief"]
+
+    def forward(self, y: TensorDictBase) -> Tensor:
+        """Zeros ``[*B]`` of the belief's type."""
+        return y.get("belief").new_zeros(y.batch_size)
+
+
+class SteadyStateCost(nn.Module):
+    r""":math:`\hat J(y)=\hat g(y)/(1-\alpha)`: the present stage cost for ever, as if damage neither grew nor was repaired.
+
+    Args:
+        model: the repair model; its stage cost does not depend on the control.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> problem = make_problem("line3")
+        >>> y = problem.start(torch.arange(2))
+        >>> stage = SteadyStateCost(problem.model)(y) * (1 - problem.model.discount)
+        >>> torch.allclose(stage, problem.model.expected_cost(y))
+        True
+    """
+
+    in_keys = ["belief"]
+
+    def __init__(self, model: RepairModel) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, y: TensorDictBase) -> Tensor:
+        """Costs ``[*B]``."""
+        return self.model.expected_cost(y) / (1.0 - self.model.discount)
+
+
+class NeverRepairCost(nn.Module):
+    r"""Exact cost of never repairing, the sum over locations of :math:`b\,(I-\alpha P)^{-1}c`, with P the damage chain.
+
+    Where costs grow with the level and a worse level tends to stay worse, as in the paper's chain, no policy costs more.
+
+    Args:
+        model: the repair model.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> problem = make_problem("line3")
+        >>> y = problem.start(torch.arange(2))
+        >>> bool((NeverRepairCost(problem.model)(y) >= SteadyStateCost(problem.model)(y)).all())
+        True
+    """
+
+    in_keys = ["belief"]
+
+    def __init__(self, model: RepairModel) -> None:
+        super().__init__()
+        self.model = model
+        chain = model.chain.double()
+        system = torch.eye(model.num_levels, dtype=chain.dtype, device=chain.device) - model.discount * chain
+        # Discounted cost of one location that starts at each level.
+        self.level_costs = tuple(torch.linalg.solve(system, model.costs.double()).tolist())
+
+    def forward(self, y: TensorDictBase) -> Tensor:
+        """Costs ``[*B]``."""
+        # Planes [L, K, *B] are summed in the same order whatever the batch.
+        return sum_first(location_costs(y.get("belief").movedim((-2, -1), (0, 1)), self.level_costs))
+
+
+class PolicyCost(TensorDictModuleBase):
+    r""":math:`J_\mu(y)`, the mean cost of simulated trajectories of a policy; cut ones end with :math:`\hat J`.
+
+    It labels states with the policy's cost-to-go; its method :meth:`costs` is a terminal cost. The noise of a trajectory is
+    a function of (seed, state, trajectory, step) alone, the state being identified by its content, so that an estimate
+    depends neither on the batch nor on who computes it.
+
+    Args:
+        model: the belief model.
+        policy: :math:`\mu`, writes ``"action"``.
+
+    Keyword Args:
+        trajectories: simulated trajectories from each state.
+        truncation: see :class:`TruncatedRollout`.
+        terminal_cost: :math:`\hat J`, see :class:`TruncatedRollout`.
+        max_steps: largest m, see :class:`TruncatedRollout`.
+        seed: seed of the simulations.
+        chunk_rows: see :class:`TruncatedRollout`; on a CPU each of ``torch.get_num_threads()`` threads has such a chunk.
+
+    Raises:
+        ValueError: if a number is not positive, or by :class:`TruncatedRollout`; when called, if a state does not fit the
+            model.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> problem = make_problem("line3")
+        >>> cost = PolicyCost(problem.model, GreedyRepair(problem.model), trajectories=5)
+        >>> y = cost(problem.start(torch.arange(400)))
+        >>> bool((y["cost_to_go"].mean() - 195).abs() < 15)
+        True
+    """
+
+    out_keys = ["cost_to_go"]
+
+    def __init__(
+        self,
+        model: BeliefModel,
+        policy: Policy,
+        *,
+        trajectories: int = 1,
+        truncation: Truncation | None = None,
+        terminal_cost: TerminalCost | None = None,
+        max_steps: int = 400,
+        seed: int = 0,
+        chunk_rows: int = 16384,
+    ) -> None:
+        super().__init__()
+        if trajectories < 1:
+            raise ValueError(f"trajectories must be at least 1, got {trajectories}")
+        self.in_keys = list(model.state_keys)
+        self.model = model
+        self.rollout = TruncatedRollout(
+            model, policy, max_steps=max_steps, truncation=truncation, terminal_cost=terminal_cost, chunk_rows=chunk_rows
+        )
+        self.trajectories, self.seed = trajectories, seed
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"cost_to_go"`` ``[*B]``."""
+        return tensordict.set("cost_to_go", self.costs(tensordict))
+
+    @torch.no_grad()
+    def costs(self, y: TensorDictBase) -> Tensor:
+        """Estimated costs ``[*B]`` of feature states ``[*B]``."""
+        self.model.check_state(y)
+        if y.batch_size.numel() == 0:
+            return torch.zeros(y.batch_size, dtype=self.model.dtype, device=self.model.device)
+        flat = self.model.with_features(y, self.model.state_keys).reshape(-1)
+        threads = torch.get_num_threads() if self.model.device.type == "cpu" else 1
+        size = max(1, _CHUNKS_PER_BLOCK * self.rollout.chunk_rows // self.trajectories)
+        size = min(size, -(-flat.shape[0] // threads))
+        return torch.cat(map_threads(self._costs, flat.split(size), threads)).view(y.batch_size)
+
+    def _costs(self, y: TensorDictBase) -> Tensor:
+        """Costs ``[N]`` of a flat batch."""
+        count = self.trajectories
+        each = torch.arange(count, device=y.device)
+        # [n, N]: one key for each trajectory and state.
+        keys = fold(fold(self.model.fingerprint(y), self.seed), each.unsqueeze(-1))
+        rows = take_rows(y, torch.arange(y.shape[0], device=y.device).repeat(count))
+        return sum_first(self.rollout(rows, keys.flatten()).view(count, -1)) / count
