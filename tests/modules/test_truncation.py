@@ -82,6 +82,16 @@ def test_stop_times_that_are_known(name, chunk_rows):
     torch.testing.assert_close(cost(y, torch.arange(4)), torch.tensor(expected), rtol=1e-6, atol=0)
 
 
+def test_a_trajectory_that_waits_long_after_its_end_adds_nothing():
+    """One in ten ends by max_steps between two renewals of the chunk and stays in place beyond it."""
+    start = torch.tensor([0] + [1] * 9 + [0] * 9)
+    rule = AfterSteps(lambda y: torch.where(y["partition"] == 1, 5, 20))
+    cost = TruncatedRollout(ring(), only, max_steps=10, truncation=rule, terminal_cost=hundred, chunk_rows=10)
+    by_start = [sum(0.5**k * ((i + k) % 4 + 1) for k in range(steps)) + 0.5**steps * 100 for i, steps in ((0, 10), (1, 5))]
+    y = TensorDict({"belief": torch.eye(4)[start]}, [19])
+    torch.testing.assert_close(cost(y, torch.arange(19)), torch.tensor(by_start)[start], rtol=1e-6, atol=0)
+
+
 def naive_cost(model, policy, y, key, stop, terminal_cost, max_steps):
     """Cost and steps of one trajectory, written down as the paper says it; ``stop(y, age, start)`` is the rule."""
     y = start = model.with_features(y.reshape(1))

@@ -42,10 +42,12 @@ def terminal_costs(terminal_cost: TerminalCost, y: TensorDictBase) -> Tensor:
         y: feature states ``[*B]`` with the entries that it reads; a TensorDictModule may write into it.
 
     Raises:
-        ValueError: if the costs have not the shape of the batch.
+        ValueError: if there are no costs or they have not the shape of the batch.
     """
     result = terminal_cost(y)
-    cost = result if isinstance(result, Tensor) else result.get("state_value")
+    cost = result if isinstance(result, Tensor) else result.get("state_value", None)
+    if cost is None:
+        raise ValueError("terminal_cost must return costs or write 'state_value', got a TensorDict without it")
     if cost.shape != y.batch_size:
         raise ValueError(f"terminal_cost must give costs of shape {tuple(y.batch_size)}, got {tuple(cost.shape)}")
     return cost
