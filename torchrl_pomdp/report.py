@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +15,7 @@ from torchrl_pomdp.evaluation import Comparison, Estimate
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Result", "cost_figure", "table", "trajectory_figure", "write_metrics"]
+__all__ = ["Result", "cost_figure", "interval_text", "iteration_figure", "table", "time_figure", "trajectory_figure"]
 
 
 @dataclass(frozen=True)
@@ -48,22 +46,20 @@ def table(results: Sequence[Result]) -> str:
         c = result.comparison
         low, high = c.ratio.interval
         lines.append(
-            f"| {result.name} | {c.cost.mean:.1f} ± {_half(c.cost):.1f} | {c.difference.mean:+.1f} ± "
+            f"| {result.name} | {interval_text(c.cost)} | {c.difference.mean:+.1f} ± "
             f"{_half(c.difference):.1f} | {c.ratio.mean:.3f} | {low:.3f} … {high:.3f} |"
         )
     return "\n".join(lines)
 
 
-def write_metrics(path: Path, results: Sequence[Result]) -> None:
-    """Write results as CSV, one policy a row; means, standard errors and sample sizes."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["policy", "states", "cost", "cost_se", "difference", "difference_se", "ratio", "ratio_se"])
-        for result in results:
-            c = result.comparison
-            estimates = (c.cost, c.difference, c.ratio)
-            values = [value for e in estimates for value in (e.mean, e.standard_error)]
-            writer.writerow([result.name, c.cost.count, *values])
+def interval_text(value: Estimate) -> str:
+    """Mean and half width of the 95 % interval.
+
+    Examples:
+        >>> interval_text(Estimate(mean=15.0, standard_error=5.0, count=2))
+        '15.0 ± 9.8'
+    """
+    return f"{value.mean:.1f} ± {_half(value):.1f}"
 
 
 def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
@@ -81,6 +77,63 @@ def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
     axes.set_ylabel("discounted cost")
     axes.set_title(title)
     axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def iteration_figure(lines: Mapping[str, Sequence[Comparison]]) -> Figure:
+    """Ratio to greedy against iteration, one line for each run; iteration 0 is the base policy.
+
+    Args:
+        lines: comparisons of base policy, first iteration, second iteration, ... by run.
+
+    Raises:
+        ImportError: if matplotlib, the extra ``plot``, is not installed.
+    """
+    figure = _new_figure(6.0, 3.8)
+    axes = figure.add_subplot()
+    for number, (name, comparisons) in enumerate(lines.items()):
+        ratios = [comparison.ratio for comparison in comparisons]
+        # A little apart, so that intervals do not hide each other.
+        x = [i + 0.04 * number for i in range(len(ratios))]
+        axes.errorbar(x, [r.mean for r in ratios], yerr=[_half(r) for r in ratios], capsize=4, marker="o", label=name)
+    axes.set(xlabel="iteration", ylabel="cost, ratio to greedy")
+    axes.locator_params(axis="x", integer=True)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    return figure
+
+
+def time_figure(runs: dict[str, list[dict[str, Any]]]) -> Figure:
+    """Time of labelling and training by part, stacked; beside it what it would be with one processor for each part.
+
+    Args:
+        runs: iterations of every run, as a run's ``iterations.json`` has them.
+
+    Raises:
+        ImportError: if matplotlib, the extra ``plot``, is not installed.
+    """
+    figure = _new_figure(2.2 * len(runs) + 2.5, 4.0)
+    axes = figure.add_subplot()
+    ticks, labels = [], []
+    for number, (name, iterations) in enumerate(runs.items()):
+        steps: dict[str, list[float]] = {}
+        bottom = 0.0
+        for iteration in iterations:
+            for part, record in iteration["parts"].items():
+                for kind, colour in (("label_seconds", "#3572a5"), ("train_seconds", "#e8a33d")):
+                    axes.bar(number, record[kind], 0.36, bottom=bottom, color=colour, edgecolor="white", linewidth=0.4)
+                    bottom += record[kind]
+                steps.setdefault(part.rsplit("-part-", 1)[0], []).append(record["label_seconds"] + record["train_seconds"])
+        # The parts of a step do not wait for each other, steps do.
+        axes.bar(number + 0.4, sum(max(times) for times in steps.values()), 0.36, color="#9aa5b1")
+        ticks.append(number + 0.2)
+        labels.append(name)
+    for colour, label in (("#3572a5", "labelling"), ("#e8a33d", "training"), ("#9aa5b1", "one processor for each part")):
+        axes.bar(0, 0, color=colour, label=label)
+    axes.set_xticks(ticks, labels, fontsize="small")
+    axes.set_ylabel("seconds")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize="small")
     return figure
 
 

@@ -76,7 +76,12 @@ def test_zero_is_zero_for_any_model_and_the_cut_rollout_is_the_sum_of_its_stage_
 def functions(model):
     greedy = GreedyRepair(model)
     policy_cost = PolicyCost(model, greedy, trajectories=13, max_steps=40, chunk_rows=64)
-    return {"zero": ZeroCost().costs, "steady": SteadyStateCost(model).costs, "never": NeverRepairCost(model).costs, "policy": policy_cost.costs}
+    return {
+        "zero": ZeroCost().costs,
+        "steady": SteadyStateCost(model).costs,
+        "never": NeverRepairCost(model).costs,
+        "policy": policy_cost.costs,
+    }
 
 
 @pytest.mark.parametrize("name", ["zero", "steady", "never", "policy"])

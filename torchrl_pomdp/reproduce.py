@@ -1,0 +1,257 @@
+"""The paper's experiments (Section VI-D) as training runs, with tables and figures beside the published numbers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from tqdm import tqdm
+
+from torchrl_pomdp.evaluation import Comparison
+from torchrl_pomdp.files import write_atomically, write_json
+from torchrl_pomdp.report import Result, cost_figure, interval_text, iteration_figure, time_figure
+from torchrl_pomdp.trainers.config import PolicyIterationConfig
+from torchrl_pomdp.trainers.run import TrainingRun, provenance
+
+__all__ = ["EXPERIMENTS", "PUBLISHED", "Experiment", "plan", "reproduce", "settings_config"]
+
+PUBLISHED = {
+    ("grid5x4", "greedy"): 5476.79,
+    ("grid5x4", "pAPI-NT 1"): 5255.64,
+    ("grid5x4", "pAPI-NT 2"): 4952.26,
+    ("grid6x6", "greedy"): 18799.5,
+    ("grid6x6", "pAPI-NT 1"): 18037.1,
+    ("grid6x6", "pAPI-NT 2"): 17341.9,
+    ("two_robots20", "greedy"): 4142.84,
+    ("two_robots20", "pAPI-NT 1"): 3321.95,
+    ("two_robots20", "pAPI-NT 2"): 3133.08,
+}
+"""Costs of the paper's Table I by problem and policy."""
+
+# Labelled states of each part in the paper.
+_SAMPLES = {"linear20": 200_000}
+_MORE_SAMPLES = 500_000
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Problems and algorithms that are set beside each other.
+
+    Attributes:
+        name: what the command calls it.
+        problems: names of the problems.
+        algorithms: names of the algorithms that learn.
+    """
+
+    name: str
+    problems: tuple[str, ...]
+    algorithms: tuple[Literal["pAPI-NT", "pAPI-T", "API"], ...]
+
+
+EXPERIMENTS = {
+    experiment.name: experiment
+    for experiment in (
+        Experiment("table1", ("grid5x4", "grid6x6", "two_robots20"), ("pAPI-NT",)),
+        Experiment("architectures", ("linear20",), ("API", "pAPI-NT", "pAPI-T")),
+        Experiment("ablation", ("linear20",), ("pAPI-NT", "pAPI-T")),
+    )
+}
+"""The experiments by name."""
+
+
+def settings_config(settings: Literal["paper", "tuned"], problem: str, scale: float, seed: int) -> PolicyIterationConfig:
+    """The numbers of a policy iteration at a fraction of the paper's samples.
+
+    Args:
+        settings: ``"paper"``: flattened beliefs, squared error, a tenth of the states from the memory, no exploration, no
+            mirror images, two iterations. ``"tuned"``: what has worked best here.
+        problem: name of the problem.
+        scale: fraction of the paper's samples, positive.
+        seed: seed of the training.
+
+    Raises:
+        ValueError: if ``scale`` is not positive.
+
+    Examples:
+        >>> settings_config("paper", "linear20", 0.5, seed=0).samples_per_part
+        100000
+    """
+    if not scale > 0:
+        raise ValueError(f"scale must be positive, got {scale}")
+    samples = max(1, round(scale * _SAMPLES.get(problem, _MORE_SAMPLES)))
+    common = PolicyIterationConfig(samples_per_part=samples, value_samples=samples, seed=seed)
+    if settings == "tuned":
+        return replace(common, iterations=3, epochs=8)
+    return replace(
+        common,
+        iterations=2,
+        encoder="flat",
+        loss="l2",
+        visited_share=0.1,
+        exploration=0.0,
+        symmetries=False,
+    )
+
+
+def plan(
+    experiment: Experiment,
+    settings: Literal["paper", "tuned"],
+    base: Literal["greedy", "urgency"],
+    scale: float,
+    seed: int,
+    problems: Sequence[str] = (),
+) -> dict[str, TrainingRun]:
+    """The training runs of an experiment by name.
+
+    Raises:
+        ValueError: if a problem is not one of the experiment's.
+
+    Examples:
+        >>> list(plan(EXPERIMENTS["ablation"], "paper", "greedy", 0.1, seed=0))
+        ['linear20-pAPI-NT-paper-greedy-scale0.1-seed0', 'linear20-pAPI-T-paper-greedy-scale0.1-seed0']
+    """
+    unknown = [problem for problem in problems if problem not in experiment.problems]
+    if unknown:
+        raise ValueError(f"problems must be among {experiment.problems} for {experiment.name}, got {unknown[0]!r}")
+    runs = {}
+    for problem in problems or experiment.problems:
+        for algorithm in experiment.algorithms:
+            config = settings_config(settings, problem, scale, seed)
+            if algorithm == "API":
+                config = replace(config, samples_per_part=6 * config.samples_per_part)
+            name = f"{problem}-{algorithm}-{settings}-{base}-scale{scale:g}-seed{seed}"
+            runs[name] = TrainingRun(problem, algorithm, base, config)
+    return runs
+
+
+def reproduce(
+    experiment: Experiment,
+    *,
+    scale: float,
+    settings: Literal["paper", "tuned"] = "tuned",
+    base: Literal["greedy", "urgency"] = "greedy",
+    problems: Sequence[str] = (),
+    seed: int = 0,
+    runs: Path = Path("runs"),
+    out: Path = Path("results"),
+    device: torch.device | str = "cpu",
+    report: Callable[[str, str, Comparison], None] = lambda run, policy, comparison: None,
+    progress: bool = False,
+) -> str:
+    """Carry out an experiment, or go on with an interrupted one, and write numbers, a table and figures.
+
+    Args:
+        experiment: one of :data:`EXPERIMENTS`.
+
+    Keyword Args:
+        scale: fraction of the paper's samples; 1 is the paper's.
+        settings: see :func:`settings_config`.
+        base: base policy that is improved first; the paper's is greedy.
+        problems: only these problems; none: all of the experiment's.
+        seed: seed of the training.
+        runs: folder of the run folders.
+        out: folder of the results, ``NAME.json``, ``NAME.md`` and ``NAME-*.png``.
+        device: where to compute.
+        report: called with run, policy and its comparison with greedy as soon as it is known.
+        progress: whether to show progress; the outer bar counts labelled states and estimates the time left.
+
+    Returns:
+        the table, Markdown.
+
+    Raises:
+        ValueError: if ``scale`` is not positive or a problem is not one of the experiment's.
+    """
+    planned = plan(experiment, settings, base, scale, seed, problems)
+    results: dict[str, dict[str, Comparison]] = {}
+    iterations: dict[str, list[dict[str, Any]]] = {}
+    total = sum(_planned_labels(run) for run in planned.values())
+    with tqdm(total=total, unit="label", desc=experiment.name, disable=not progress) as bar:
+        for name, run in planned.items():
+            results[name] = run.carry_out(
+                runs / name,
+                device=device,
+                progress=progress,
+                report=partial(report, name),
+            )
+            iterations[name] = json.loads((runs / name / "iterations.json").read_text())
+            bar.update(_planned_labels(run))
+    title = f"{experiment.name}-{settings}-{base}-scale{scale:g}-seed{seed}"
+    if problems:
+        title = f"{title}-{'-'.join(problems)}"
+    content = {
+        "experiment": experiment.name,
+        "settings": settings,
+        "base": base,
+        "scale": scale,
+        "seed": seed,
+        "provenance": provenance(),
+        "runs": {name: asdict(run) for name, run in planned.items()},
+        "results": {name: {p: asdict(c) for p, c in found.items()} for name, found in results.items()},
+        "iterations": iterations,
+    }
+    write_json(out / f"{title}.json", content)
+    text = comparison_table({name: (run.problem, results[name]) for name, run in planned.items()})
+    write_atomically(out / f"{title}.md", lambda path: path.write_text(text + "\n"))
+    _draw(out, title, planned, results, iterations)
+    return text
+
+
+def comparison_table(results: dict[str, tuple[str, dict[str, Comparison]]]) -> str:
+    """Markdown table of all policies of all runs (problem and comparisons by run) beside the published numbers.
+
+    Examples:
+        >>> from torchrl_pomdp.evaluation import compare
+        >>> cost = torch.tensor([10.0, 20.0])
+        >>> print(comparison_table({"a": ("grid5x4", {"greedy": compare(cost, cost)})}))
+        | problem | policy | states | cost | ratio to greedy | 95 % interval | paper: cost | paper: ratio |
+        |---|---|---|---|---|---|---|---|
+        | grid5x4 | greedy | 2 | 15.0 ± 9.8 | 1.000 | 1.000 … 1.000 | 5476.79 | 1.000 |
+    """
+    lines = [
+        "| problem | policy | states | cost | ratio to greedy | 95 % interval | paper: cost | paper: ratio |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for problem, found in results.values():
+        for policy, comparison in found.items():
+            published, greedy = PUBLISHED.get((problem, policy)), PUBLISHED.get((problem, "greedy"))
+            beside = f"{published} | {published / greedy:.3f}" if published and greedy else " | "
+            low, high = comparison.ratio.interval
+            lines.append(
+                f"| {problem} | {policy} | {comparison.cost.count} | {interval_text(comparison.cost)} | "
+                f"{comparison.ratio.mean:.3f} | {low:.3f} … {high:.3f} | {beside} |"
+            )
+    return "\n".join(lines)
+
+
+def _planned_labels(run: TrainingRun) -> int:
+    parts = 1 if run.algorithm == "API" else 6
+    values = 3 * run.config.value_samples if run.algorithm == "pAPI-T" else 0
+    return run.config.iterations * (parts * run.config.samples_per_part + values)
+
+
+def _draw(
+    out: Path,
+    title: str,
+    planned: dict[str, TrainingRun],
+    results: dict[str, dict[str, Comparison]],
+    iterations: dict[str, list[dict[str, Any]]],
+) -> None:
+    """Bars for each run, cost against iteration, and training time by part."""
+    for name, run in planned.items():
+        bars = [Result(policy, comparison) for policy, comparison in results[name].items()]
+        figure = cost_figure(bars, f"{name}; below each policy its ratio to greedy")
+        write_atomically(out / f"{title}-{run.problem}-{run.algorithm}.png", figure.savefig)
+    lines = {}
+    for name, run in planned.items():
+        found = results[name]
+        lines[f"{run.problem}, {run.algorithm}"] = [found[run.base]] + [
+            found[policy] for policy in found if policy.removeprefix(f"{run.algorithm} ").isdigit()
+        ]
+    write_atomically(out / f"{title}-iterations.png", iteration_figure(lines).savefig)
+    times = {f"{run.problem}, {run.algorithm}": iterations[name] for name, run in planned.items()}
+    write_atomically(out / f"{title}-time.png", time_figure(times).savefig)
