@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import csv
 import json
 
 import pytest
@@ -9,50 +8,77 @@ import torch
 from torchrl_pomdp.cli import main
 from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
+from torchrl_pomdp.files import write_atomically
 from torchrl_pomdp.modules import GreedyRepair
 from torchrl_pomdp.report import trajectory_figure
-from torchrl_pomdp.trainers.checkpoint import write_atomically
 
-TINY = "--iterations 1 --samples-per-part 60 --trajectories 2 --epochs 1 --batch-size 30 --max-steps 60 --states 20"
+TINY = (
+    "--iterations 1 --samples-per-part 60 --trajectories 2 --epochs 1 --batch-size 30 --max-steps 60 --states 20 "
+    "--validation-states 30 --visits 50 --value-samples 50"
+)
 
 
-def test_train_and_evaluate(tmp_path, capsys):
+def snapshot(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("algorithm", ["pAPI-NT", "pAPI-T", "API"])
+def test_train_evaluate_and_resume(tmp_path, capsys, algorithm):
     out = tmp_path / "run"
-    assert main(["train", "line3", *TINY.split(), "--out", str(out)]) == 0
+    command = ["train", "line3", "--algorithm", algorithm, *TINY.split(), "--online-states", "10", "--out", str(out)]
+    assert main(command) == 0
     text = capsys.readouterr().out
     assert "line of 3, 1 robot: 3.8e+02 states" in text
-    assert "| pAPI-NT 1 |" in text
+    assert f"| {algorithm} 1 |" in text
     config = json.loads((out / "config.json").read_text())
-    assert (config["problem"], config["samples_per_part"]) == ("line3", 60)
-    with (out / "metrics.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert [row["policy"] for row in rows] == ["greedy", "R-NT", "pAPI-NT 1"]
-    assert float(rows[0]["ratio"]) == 1.0
+    assert (config["problem"], config["config"]["samples_per_part"]) == ("line3", 60)
+    metrics = json.loads((out / "metrics.json").read_text())
+    policies = ["greedy", "urgency", "R-T of greedy", "R-NT of greedy", f"{algorithm} 1"]
+    assert list(metrics)[:5] == policies
+    assert metrics["greedy"]["ratio"]["mean"] == 1.0
+    (iteration,) = json.loads((out / "iterations.json").read_text())
+    assert iteration["accepted"] in (True, False)
+    assert "validation states" in iteration["reason"]
     for name in ("costs.png", "trajectory.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
     assert main(["evaluate", str(out / "iteration-1.pt"), "--states", "20"]) == 0
-    again = capsys.readouterr().out
-    expected = float(rows[2]["ratio"])
-    assert f"| {expected:.3f} |" in again, "a checkpoint evaluates to what the run reported"
-    before = {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    expected = metrics[f"{algorithm} 1"]["ratio"]["mean"]
+    assert f"| {expected:.3f} |" in capsys.readouterr().out, "a checkpoint evaluates to what the run reported"
+    tensors = {path: content for path, content in snapshot(out).items() if path.suffix in (".pt", ".json")}
+    assert main(command) == 0
+    assert {path: content for path, content in snapshot(out).items() if path.suffix in (".pt", ".json")} == tensors
+
+
+def test_a_run_folder_of_another_run_is_left_alone(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(["train", "line3", *TINY.split(), "--out", str(out)]) == 0
+    before = snapshot(out)
     assert main(["train", "line3", "--out", str(out)]) == 2
+    assert "holds another run, which differs in config, states" in capsys.readouterr().err
+    assert snapshot(out) == before
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("precious")
+    assert main(["train", "line3", "--out", str(tmp_path / "mine")]) == 2
     assert "is in use" in capsys.readouterr().err
-    assert {path: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
 
 
-@pytest.mark.parametrize("policy", ["greedy", "rollout"])
-def test_evaluate_by_name(policy, capsys):
-    assert main(["evaluate", policy, "--problem", "line3", "--states", "10"]) == 0
-    assert "| greedy |" in capsys.readouterr().out
+@pytest.mark.parametrize("policy", ["greedy", "urgency"])
+def test_evaluate_by_name_and_online(policy, capsys):
+    assert main(["evaluate", policy, "--problem", "line3", "--states", "10", "--online"]) == 0
+    text = capsys.readouterr().out
+    assert "| greedy |" in text
+    assert f"| {policy} + R-NT |" in text
 
 
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["train", "linear21"], "unknown preset 'linear21'; known presets: line3, linear20"),
+        (["train", "linear21"], "unknown preset 'linear21'; known presets: grid5x4"),
         (["evaluate", "nowhere.pt"], "there is no checkpoint nowhere.pt"),
         (["evaluate", "greedy", "--states", "0"], "num_states must be at least 1"),
+        (["reproduce", "table1", "--scale", "0"], "scale must be positive, got 0"),
+        (["reproduce", "ablation", "--problems", "grid5x4"], "problems must be among ('linear20',) for ablation"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(args, message, capsys):

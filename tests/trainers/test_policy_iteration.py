@@ -1,23 +1,57 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
-from torchrl_pomdp.envs import Problem, RepairModel, SinglePart, UniformStart, damage_chain, line, make_problem
+from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
+from torchrl_pomdp.envs import BeliefEnv, Problem, RepairModel, UniformStart, damage_chain, line, make_problem
 from torchrl_pomdp.evaluation import compare, discounted_costs
-from torchrl_pomdp.modules import GreedyRepair
-from torchrl_pomdp.trainers import PolicyIteration, PolicyIterationConfig, make_networks
+from torchrl_pomdp.modules import (
+    GreedyRepair,
+    NeverRepairCost,
+    PolicyCost,
+    PolicyNetwork,
+    RolloutPolicy,
+    UrgencyRepair,
+    ValueNetwork,
+)
+from torchrl_pomdp.objectives import ClassificationLoss
+from torchrl_pomdp.trainers import (
+    Evaluate,
+    Improve,
+    PolicyIteration,
+    PolicyIterationConfig,
+    api,
+    make_networks,
+    make_values,
+    papi_nt,
+    papi_t,
+    train_part,
+)
+from torchrl_pomdp.trainers import policy_iteration as module
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 
 TINY = PolicyIterationConfig(
-    iterations=1, samples_per_part=200, trajectories=2, epochs=2, batch_size=50, hidden=(16,), max_steps=60
+    iterations=1,
+    samples_per_part=200,
+    value_samples=150,
+    trajectories=2,
+    epochs=2,
+    batch_size=50,
+    hidden=(16,),
+    value_hidden=(16,),
+    max_steps=60,
+    visits=100,
+    validation_states=100,
 )
 
 
-def run(problem, config=TINY):
-    return list(PolicyIteration(problem, config, GreedyRepair(problem.model)))
+def run(problem, config=TINY, recipe=papi_nt, **options):
+    return list(recipe(problem, config, GreedyRepair(problem.model), **options))
 
 
 def weights(policy):
@@ -25,57 +59,236 @@ def weights(policy):
 
 
 def test_policy_iteration_improves_greedy_on_the_line_of_3(line3):
-    config = PolicyIterationConfig(iterations=1, samples_per_part=1500, trajectories=10, epochs=30, batch_size=64)
-    policy = run(line3, config)[-1]
+    config = replace(TINY, samples_per_part=1500, trajectories=10, epochs=30, hidden=(256, 64), max_steps=400, visits=2000)
+    iteration = papi_nt(line3, replace(config, validation_states=4000), GreedyRepair(line3.model))
+    (only,) = iteration
+    assert only.accepted
+    assert iteration.best is only.policy
     greedy = discounted_costs(line3.model, GreedyRepair(line3.model), line3.start, num_states=4000)
-    comparison = compare(discounted_costs(line3.model, policy, line3.start, num_states=4000), greedy)
+    comparison = compare(discounted_costs(line3.model, only.policy, line3.start, num_states=4000), greedy)
     assert comparison.ratio.interval[1] < 1.0
     assert comparison.cost.mean + 3 * comparison.cost.standard_error > 168.96, "nothing is below the optimum"
 
 
-def test_the_same_seed_gives_the_same_policy_and_the_global_generator_is_untouched(line3):
+@pytest.mark.parametrize("recipe", [papi_nt, papi_t])
+def test_the_same_seed_gives_the_same_policy_and_the_global_generator_is_untouched(line3, recipe):
     state = torch.random.get_rng_state()
     with warnings.catch_warnings():
         warnings.filterwarnings("error", module="torchrl_pomdp")
-        first = run(line3)[0]
+        first = run(line3, recipe=recipe)[0]
     assert torch.equal(torch.random.get_rng_state(), state)
     torch.manual_seed(123)
-    assert torch.equal(weights(run(line3)[0]), weights(first))
-    other = PolicyIterationConfig(**{**TINY.__dict__, "seed": 1})
-    assert not torch.equal(weights(run(line3, other)[0]), weights(first))
+    second = run(line3, recipe=recipe)[0]
+    assert torch.equal(weights(second.policy), weights(first.policy))
+    assert torch.equal(weights(second.value), weights(first.value)) if recipe is papi_t else True
+    assert not torch.equal(weights(run(line3, replace(TINY, seed=1), recipe)[0].policy), weights(first.policy))
+
+
+def collected(monkeypatch, problem, recipe):
+    """What each collector of an iteration simulates: step, part, local policies, values, truncation."""
+    seen = []
+    original = PolicyIteration._collector
+
+    def record(self, step, policy, value, number, cache, part):
+        local = [type(p).__name__ for p in policy.policies]
+        values = [type(v).__name__ for v in value.values]
+        seen.append((type(step).__name__, part, local, values, step.truncation))
+        return original(self, step, policy, value, number, cache, part)
+
+    monkeypatch.setattr(PolicyIteration, "_collector", record)
+    run(problem, recipe=recipe)
+    return seen
+
+
+GREEDY, NETWORK, NEVER, VALUE = (kind.__name__ for kind in (GreedyRepair, PolicyNetwork, NeverRepairCost, ValueNetwork))
 
 
 def test_stages_train_the_endgame_first_and_roll_the_startgame_out_with_it(line3, monkeypatch):
-    seen = []
-
-    def record(self, networks, base, stage, iteration):
-        seen.append((stage, [type(policy).__name__ for policy in base.policies]))
-
-    monkeypatch.setattr(PolicyIteration, "_train_stage", record)
-    run(line3)
-    greedy, network = "GreedyRepair", "PolicyNetwork"
-    assert seen == [((3, 4, 5), [greedy] * 6), ((0, 1, 2), [greedy] * 3 + [network] * 3)]
+    seen = collected(monkeypatch, line3, papi_nt)
+    assert [entry[:2] for entry in seen] == [("Improve", part) for part in (3, 4, 5, 0, 1, 2)]
+    assert all(entry[2] == [GREEDY] * 6 for entry in seen[:3])
+    assert all(entry[2] == [GREEDY] * 3 + [NETWORK] * 3 for entry in seen[3:])
+    assert all(entry[4] is None for entry in seen)
 
 
-def test_one_part_is_plain_policy_iteration():
-    model = RepairModel(
-        line(3), damage_chain((0.0, 0.02, 0.03, 0.05)), (0.0, 0.1, 1.0, 10.0, 100.0), 0.99, partition=SinglePart()
+def test_truncation_cuts_the_startgame_with_endgame_values_of_the_new_policy(line3, monkeypatch):
+    seen = collected(monkeypatch, line3, papi_t)
+    steps = [("Improve", p) for p in (3, 4, 5)] + [("Evaluate", p) for p in (3, 4, 5)] + [("Improve", p) for p in (0, 1, 2)]
+    assert [entry[:2] for entry in seen] == steps
+    assert all(entry[2] == [GREEDY] * 3 + [NETWORK] * 3 for entry in seen[3:]), "values are those of the new endgame policy"
+    assert all(entry[3] == [NEVER] * 3 + [VALUE] * 3 for entry in seen[6:]), "6 policy and 3 value networks"
+    assert all(entry[4] is None for entry in seen[:6])
+    assert all(entry[4].parts == (3, 4, 5) for entry in seen[6:])
+
+
+def test_all_six_parts_can_have_values(line3):
+    plan = [Improve((3, 4, 5)), Evaluate((3, 4, 5)), Improve((0, 1, 2)), Evaluate((0, 1, 2))]
+    (iteration,) = PolicyIteration(line3, TINY, GreedyRepair(line3.model), plan)
+    assert all(isinstance(value, ValueNetwork) for value in iteration.value.values)
+
+
+def test_truncation_saves_simulated_steps(linear20):
+    config = replace(TINY, samples_per_part=100, value_samples=100, max_steps=400)
+    steps = []
+    for recipe in (papi_nt, papi_t):
+        (iteration,) = run(linear20, config, recipe)
+        steps.append(
+            sum(r.simulated_steps for name, r in iteration.records.items() if "improve-part" in name and name[-1] in "012")
+        )
+        assert all(record.simulated_steps > record.samples for record in iteration.records.values())
+    assert steps[1] < 0.5 * steps[0]
+
+
+def test_one_part_equals_the_unpartitioned_run_bit_for_bit():
+    """Collector, loss and trainer with a bare network and no router anywhere, against API."""
+    problem = make_problem("line3", partitioned=False)
+    config = replace(TINY, symmetries=False, visited_share=0.0)
+    greedy = GreedyRepair(problem.model)
+    algorithm = api(problem, config, greedy)
+    (iteration,) = algorithm
+    bare = make_networks(problem, config, algorithm._seed(1, "weights")).policies[0]
+    label = partial(
+        RolloutPolicy, trajectories=config.trajectories, max_steps=config.max_steps, seed=algorithm._seed(1, "labels")
     )
-    start = UniformStart(model)
-    problem = Problem("line of 3, one part", model, start, (start,))
-    assert len(run(problem)[0].policies) == 1
+    collector = RolloutImprovement(
+        BeliefEnv(problem.model, problem.start),
+        greedy,
+        states=PartSampler({0: problem.training[0]}, algorithm._seed(1, "states")),
+        frames_per_batch=config.samples_per_part,
+        total_frames=config.samples_per_part,
+        label=label,
+    )
+    (batch,) = collector
+    train_part(batch.exclude("collector"), ClassificationLoss(bare), config, seed=algorithm._seed(1, "batches"), name="bare")
+    assert torch.equal(weights(bare), weights(iteration.policy))
+    y = problem.model.with_features(problem.start(torch.arange(50)))
+    with torch.no_grad():
+        assert torch.equal(bare(y.copy())["logits"], iteration.policy(y.copy())["logits"])
+
+
+def test_mirror_images_are_training_data_of_their_parts(line3):
+    algorithm = papi_nt(line3, TINY, GreedyRepair(line3.model))
+    labelled = {}
+    for part in (0, 1, 2):
+        y = line3.model.with_features(line3.training[part](torch.arange(30)))
+        y.set(("collector", "mask"), torch.ones(30, dtype=torch.bool))
+        labelled[part] = RolloutPolicy(line3.model, GreedyRepair(line3.model), trajectories=1)(y)
+    images = algorithm._images(labelled)
+    assert [len(images[part]) for part in (0, 1, 2)] == [60, 60, 60]
+    left, right, repair = 1, 2, 0
+    mirrored = images[0][30:]
+    assert torch.equal(mirrored["belief"], labelled[2]["belief"].flip(1))
+    swap = torch.tensor([repair, right, left])
+    assert torch.equal(mirrored["action"], swap[labelled[2]["action"]])
+
+
+def test_a_worse_iteration_is_rejected_and_the_best_policy_stays(line3):
+    """Hardly any training makes networks that are worse than a near-optimal base policy."""
+    base = UrgencyRepair(line3.model)
+    algorithm = papi_nt(line3, replace(TINY, iterations=2, samples_per_part=20, epochs=1), base)
+    iterations = list(algorithm)
+    assert [iteration.accepted for iteration in iterations] == [False, False]
+    assert algorithm.best is base
+    assert all("not lower with confidence" in iteration.reason for iteration in iterations)
+    assert all(iteration.comparison.ratio.mean > 1 for iteration in iterations)
+    assert not torch.equal(weights(iterations[0].policy), weights(iterations[1].policy)), "it tries other states"
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing catches it."""
+
+
+@pytest.mark.parametrize("where", ["label", "train", "validate"])
+@pytest.mark.parametrize("recipe", [papi_nt, papi_t])
+def test_killed_and_resumed_equals_uninterrupted(line3, tmp_path, monkeypatch, where, recipe):
+    config = replace(TINY, iterations=2)
+    whole = run(line3, config, recipe, folder=tmp_path / "whole")
+    broken = {"label": (module.RolloutImprovement, "rollout"), "train": (module, "train_part"), "validate": (module, "compare")}
+    owner, name = broken[where]
+    original, calls = getattr(owner, name), []
+
+    def interrupted(*args, **kwargs):
+        calls.append(name)
+        if len(calls) in (2, 5, 9):
+            raise Killed
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, interrupted)
+    attempts = 0
+    while True:
+        attempts += 1
+        try:
+            resumed = run(line3, config, recipe, folder=tmp_path / "broken")
+            break
+        except Killed:
+            assert attempts < 10
+    assert attempts > 1
+    for one, other in zip(whole, resumed, strict=True):
+        assert torch.equal(weights(one.policy), weights(other.policy))
+        assert (one.accepted, one.comparison) == (other.accepted, other.comparison)
+        steps = [{name: r.simulated_steps for name, r in it.records.items()} for it in (one, other)]
+        assert steps[0] == steps[1]
+    files = [{p.relative_to(tmp_path / n) for p in (tmp_path / n).rglob("*") if p.is_file()} for n in ("whole", "broken")]
+    assert files[0] == files[1], "no labels and no temporary files are left"
+
+
+def test_labels_of_an_interrupted_run_are_not_made_again(line3, tmp_path, monkeypatch):
+    calls = []
+    original = RolloutPolicy.forward
+
+    def interrupted(self, y):
+        calls.append(len(y))
+        if len(calls) == 3:
+            raise Killed
+        return original(self, y)
+
+    monkeypatch.setattr(RolloutPolicy, "forward", interrupted)
+    with pytest.raises(Killed):
+        run(line3, folder=tmp_path / "run")
+    calls[:] = [0, 0, 0]
+    run(line3, folder=tmp_path / "run")
+    assert len(calls) - 3 == 4, "two of six parts were labelled before"
+
+
+def test_the_algorithms_refuse_partitions_that_do_not_fit(line3):
+    greedy = GreedyRepair(line3.model)
+    with pytest.raises(ValueError, match="a single part, 'line3' has 6: make it with partitioned=False"):
+        api(line3, TINY, greedy)
+    with pytest.raises(ValueError, match="at least two stages, problem 'line3' has 1"):
+        papi_t(make_problem("line3", partitioned=False), TINY, greedy)
+    with pytest.raises(ValueError, match="plan is empty"):
+        PolicyIteration(line3, TINY, greedy, [])
+
+
+def test_value_networks_learn_costs_of_all_magnitudes(linear20):
+    """A value network of the endgame, trained as policy iteration does it, against fresh simulations."""
+    model, greedy = linear20.model, GreedyRepair(linear20.model)
+    config = replace(TINY, value_samples=6000, value_hidden=(64, 32), epochs=10, batch_size=100, max_steps=400, visits=500)
+    algorithm = PolicyIteration(linear20, config, greedy, [Evaluate((4,))])
+    (iteration,) = algorithm
+    value = iteration.value
+    assert [type(v).__name__ for v in value.values] == [NEVER] * 4 + [VALUE] + [NEVER]
+    y = model.with_features(linear20.training[4](torch.arange(10_000, 10_400)))
+    with torch.no_grad():
+        found = value(y.copy())["state_value"]
+    exact = PolicyCost(model, greedy, trajectories=30)(y.copy())["cost_to_go"]
+    assert exact.max() / exact.min() > 1e3
+    assert float((found - exact).abs().mean() / exact.mean()) < 0.2
+    never = NeverRepairCost(model).costs(y)
+    assert float(((found - exact).abs() / never).mean()) < 0.2 * float(((never - exact) / never).mean())
 
 
 def test_models_without_a_partition_are_refused():
     model = RepairModel(line(3), damage_chain((0.0, 0.02)), (0.0, 1.0, 2.0), 0.99)
     with pytest.raises(ValueError, match="has no partition"):
-        PolicyIteration(Problem("bare", model, UniformStart(model), ()), TINY, GreedyRepair(model))
+        papi_nt(Problem("bare", model, UniformStart(model), ()), TINY, GreedyRepair(model))
 
 
 @pytest.mark.parametrize(
     "change",
     [
         {"iterations": 0}, {"samples_per_part": 0}, {"trajectories": 0}, {"max_steps": 0}, {"batch_size": 0},
+        {"visits": 0}, {"memory_capacity": 0}, {"value_samples": 0}, {"validation_states": 0}, {"value_hidden": (0,)},
         {"epochs": 0}, {"visited_share": 1.5}, {"exploration": -0.1}, {"learning_rate": 0.0}, {"hidden": ()},
     ],
 )  # fmt: skip
@@ -84,16 +297,31 @@ def test_bad_numbers_are_named(change):
         PolicyIterationConfig(**change)
 
 
-def test_checkpoints_restore_the_policy(line3, tmp_path):
-    policy = make_networks(line3, TINY, seed=5)
+@pytest.mark.parametrize("partitioned", [True, False])
+def test_checkpoints_restore_policy_values_partition_problem_and_configuration(tmp_path, partitioned):
+    problem = make_problem("line3", partitioned=partitioned)
+    policy, value = make_networks(problem, TINY, seed=5), make_values(problem, TINY, seed=6)
     path = tmp_path / "policy.pt"
-    save_checkpoint(path, Checkpoint(line3, TINY, 3, policy))
+    save_checkpoint(path, Checkpoint(problem, TINY, "pAPI-T", 3, policy, value))
     loaded = load_checkpoint(path)
-    assert (loaded.problem.name, loaded.config, loaded.iteration) == ("line3", TINY, 3)
-    assert torch.equal(weights(loaded.policy), weights(policy))
-    y = line3.model.with_features(line3.start(torch.arange(20)))
-    assert torch.equal(loaded.policy(y.copy())["action"], policy(y.copy())["action"])
+    assert (loaded.problem.name, loaded.problem.partitioned, loaded.config) == ("line3", partitioned, TINY)
+    assert (loaded.algorithm, loaded.iteration) == ("pAPI-T", 3)
+    y = problem.model.with_features(problem.start(torch.arange(20)))
+    for mine, theirs in ((loaded.policy, policy), (loaded.value, value)):
+        assert torch.equal(weights(mine), weights(theirs))
+        with torch.no_grad():
+            entry = theirs.out_keys[-1]
+            assert torch.equal(mine(y.copy())[entry], theirs(y.copy())[entry])
     assert [p.name for p in tmp_path.iterdir()] == ["policy.pt"], "no temporary file is left"
+
+
+def test_checkpoints_of_trained_policies_know_which_parts_have_values(line3, tmp_path):
+    (iteration,) = run(line3, recipe=papi_t)
+    path = tmp_path / "policy.pt"
+    save_checkpoint(path, Checkpoint(line3, TINY, "pAPI-T", 1, iteration.policy, iteration.value))
+    loaded = load_checkpoint(path)
+    assert [type(v).__name__ for v in loaded.value.values] == [NEVER] * 3 + [VALUE] * 3
+    assert torch.equal(weights(loaded.value), weights(iteration.value))
 
 
 def test_damaged_and_foreign_checkpoints_are_refused(tmp_path):
@@ -101,7 +329,9 @@ def test_damaged_and_foreign_checkpoints_are_refused(tmp_path):
     path = tmp_path / "policy.pt"
     with pytest.raises(ValueError, match="there is no checkpoint"):
         load_checkpoint(path)
-    save_checkpoint(path, Checkpoint(problem, TINY, 1, make_networks(problem, TINY, seed=0)))
+    save_checkpoint(
+        path, Checkpoint(problem, TINY, "pAPI-NT", 1, make_networks(problem, TINY, 0), make_values(problem, TINY, 0))
+    )
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match="damaged or no checkpoint"):

@@ -4,6 +4,7 @@ from torchrl_pomdp.modules.base_policies import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder, RelativeEncoder
 from torchrl_pomdp.modules.lookahead import RolloutPolicy
 from torchrl_pomdp.modules.networks import PolicyNetwork, ValueNetwork
+from torchrl_pomdp.modules.parallel import ParallelRollout
 from torchrl_pomdp.modules.partitioned import PartitionedPolicy, PartitionedValue
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, NeverRepairCost, PolicyCost, SteadyStateCost, ZeroCost
@@ -18,6 +19,7 @@ __all__ = [
     "NeverRepairCost",
     "OnEntering",
     "OnLeaving",
+    "ParallelRollout",
     "PartitionedPolicy",
     "PartitionedValue",
     "Policy",

@@ -18,11 +18,11 @@ from torchrl.record import CSVLogger
 from torchrl_pomdp.envs import Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import load_tensors, save_tensors, write_json
-from torchrl_pomdp.modules import GreedyRepair, Policy, UrgencyRepair
+from torchrl_pomdp.modules import GreedyRepair, Policy, SteadyStateCost, UrgencyRepair
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, save_checkpoint
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.policy_iteration import Iteration
-from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt
+from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt, r_t
 
 __all__ = ["ALGORITHMS", "BASE_POLICIES", "EVALUATION_SEED", "TrainingRun", "provenance"]
 
@@ -48,7 +48,7 @@ class TrainingRun:
         >>> run = TrainingRun("line3", config=config, states=20, online_states=0)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     list(run.carry_out(Path(folder) / "run"))
-        ['greedy', 'urgency', 'R-NT of greedy', 'pAPI-NT 1']
+        ['greedy', 'urgency', 'R-T of greedy', 'R-NT of greedy', 'pAPI-NT 1']
     """
 
     problem: str
@@ -116,7 +116,9 @@ class _Execution:
         bases = {name: make(model) for name, make in BASE_POLICIES.items()}
         for name, policy in bases.items():
             self._compare(name, policy, run.states)
-        self._compare(f"R-NT of {run.base}", r_nt(self.problem, bases[run.base], trajectories=config.trajectories), run.states)
+        base, steady = bases[run.base], SteadyStateCost(model)
+        self._compare(f"R-T of {run.base}", r_t(self.problem, base, steady, trajectories=config.trajectories), run.states)
+        self._compare(f"R-NT of {run.base}", r_nt(self.problem, base, trajectories=config.trajectories), run.states)
         logger = CSVLogger("log", log_dir=str(self.folder))
         training = ALGORITHMS[run.algorithm](
             self.problem, config, bases[run.base], folder=self.folder, logger=logger, progress=self.progress

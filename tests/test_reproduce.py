@@ -1,0 +1,69 @@
+"""The experiments at toy size: what they plan, write and resume, and the published numbers beside ours."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchrl_pomdp import reproduce as module
+from torchrl_pomdp.evaluation import compare
+from torchrl_pomdp.reproduce import EXPERIMENTS, Experiment, comparison_table, plan, reproduce, settings_config
+
+TOY = Experiment("toy", ("line3",), ("pAPI-NT", "pAPI-T"))
+
+
+def test_the_papers_settings_are_the_papers():
+    config = settings_config("paper", "linear20", 1.0, seed=0)
+    assert (config.samples_per_part, config.trajectories, config.hidden) == (200_000, 10, (256, 64))
+    assert (config.value_hidden, config.loss, config.encoder) == ((256, 128, 64), "l2", "flat")
+    assert (config.learning_rate, config.visited_share, config.symmetries, config.iterations) == (1e-3, 0.1, False, 2)
+    assert settings_config("paper", "grid6x6", 1.0, seed=0).samples_per_part == 500_000
+    runs = plan(EXPERIMENTS["architectures"], "paper", "greedy", 1.0, 0)
+    assert {run.algorithm: run.config.samples_per_part for run in runs.values()} == {
+        "API": 1_200_000, "pAPI-NT": 200_000, "pAPI-T": 200_000,
+    }  # fmt: skip
+
+
+def test_published_numbers_stand_beside_ours():
+    cost = torch.tensor([5000.0, 6000.0])
+    found = {"greedy": compare(cost, cost), "pAPI-NT 2": compare(0.9 * cost, cost)}
+    text = comparison_table({"run": ("grid5x4", found)})
+    assert text.splitlines()[-1].endswith("| 0.900 | 0.900 … 0.900 | 4952.26 | 0.904 |")
+
+
+def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
+    def tiny(settings, problem, scale, seed):
+        small = {"samples_per_part": 40, "value_samples": 40, "trajectories": 2, "epochs": 1, "visits": 20, "max_steps": 60}
+        return replace(settings_config(settings, problem, scale, seed), iterations=1, validation_states=20, **small)
+
+    original = plan
+    monkeypatch.setattr(module, "settings_config", tiny)
+    monkeypatch.setattr(
+        module, "plan", lambda *args: {k: replace(r, states=10, online_states=5) for k, r in original(*args).items()}
+    )
+    folders = {"runs": tmp_path / "runs", "out": tmp_path / "results"}
+    text = reproduce(TOY, scale=0.001, base="urgency", **folders)
+    stem = "toy-tuned-urgency-scale0.001-seed0"
+    content = json.loads((tmp_path / "results" / f"{stem}.json").read_text())
+    assert content["provenance"]["versions"]["torch"] == torch.__version__
+    assert {run["algorithm"] for run in content["runs"].values()} == {"pAPI-NT", "pAPI-T"}
+    for name, found in content["results"].items():
+        assert {"greedy", "urgency"} <= set(found)
+        assert len(content["iterations"][name]) == 1
+    assert (tmp_path / "results" / f"{stem}.md").read_text().strip() == text
+    pictures = {path.name.removeprefix(stem) for path in (tmp_path / "results").glob("*.png")}
+    assert pictures == {"-iterations.png", "-time.png", "-line3-pAPI-NT.png", "-line3-pAPI-T.png"}
+    before = (tmp_path / "results" / f"{stem}.json").read_bytes()
+    assert reproduce(TOY, scale=0.001, base="urgency", **folders) == text
+    assert (tmp_path / "results" / f"{stem}.json").read_bytes() == before
+
+
+def test_only_the_experiments_own_problems_can_be_chosen():
+    assert list(plan(EXPERIMENTS["table1"], "tuned", "greedy", 0.1, 3, ("grid6x6",))) == [
+        "grid6x6-pAPI-NT-tuned-greedy-scale0.1-seed3"
+    ]
+    with pytest.raises(ValueError, match="problems must be among"):
+        plan(EXPERIMENTS["table1"], "tuned", "greedy", 0.1, 0, ("linear20",))
