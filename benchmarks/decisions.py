@@ -8,16 +8,8 @@ import time
 import torch
 
 from benchmarks.harness import Table, threads
-from benchmarks.setting import Counting, linear20, networks
-from torchrl_pomdp.collectors import PartSampler, training_states
+from benchmarks.setting import Counting, linear20, networks, states
 from torchrl_pomdp.modules import GreedyRepair, RolloutPolicy, TruncatedRollout
-
-
-def _states(count: int):
-    """Training states of all six parts, as policy iteration draws them."""
-    problem = linear20()
-    parts = {part: training_states(problem, GreedyRepair(problem.model), part) for part in range(6)}
-    return problem.model.with_features(PartSampler(parts, seed=1)(torch.arange(count)))
 
 
 def decision(table: Table) -> None:
@@ -44,7 +36,7 @@ def labels(table: Table) -> None:
         ("network", networks(), "observation", 3_000, ""),
     ]
     for name, base, leaves, count, target in cases:
-        y = _states(count)
+        y = states(count, seed=1)
         policy = RolloutPolicy(problem.model, base, trajectories=10, leaves=leaves)
         policy.q_factors(y[:600])
         begin = time.perf_counter()
@@ -57,7 +49,7 @@ def labels(table: Table) -> None:
 def adaptive(table: Table) -> None:
     """Regret of decisions by 10 uniform or 14 adaptive trajectories against a reference of 2000, on 2000 states."""
     problem = linear20()
-    y = _states(2000)
+    y = states(2000, seed=1)
     reference = RolloutPolicy(problem.model, GreedyRepair(problem.model), trajectories=2000, seed=99).q_factors(y)
     settings = [("uniform", 10), ("adaptive", 14), ("uniform", 5)]
     steps, regrets = {}, {}
@@ -86,17 +78,17 @@ def adaptive(table: Table) -> None:
 
 def expectation(table: Table) -> None:
     """Core time to estimate the greedy policy's cost from one state to 1 %, with expected and with realised stage costs."""
-    problem, trajectories, states = linear20(), 200, 200
+    problem, trajectories, count = linear20(), 200, 200
     model, greedy = problem.model, GreedyRepair(problem.model)
-    y = problem.start(torch.arange(states)).select(*model.state_keys)
-    rows = y[torch.arange(states).repeat_interleave(trajectories)]
-    keys = torch.arange(states * trajectories)
+    y = problem.start(torch.arange(count)).select(*model.state_keys)
+    rows = y[torch.arange(count).repeat_interleave(trajectories)]
+    keys = torch.arange(count * trajectories)
     rollout = TruncatedRollout(model, greedy)
     with threads(1):
         needed = {}
         for name, simulate in (("expected", lambda: rollout(rows, keys)), ("realised", lambda: _realised(model, greedy, rows))):
             begin = time.perf_counter()
-            costs = simulate().view(states, trajectories).double()
+            costs = simulate().view(count, trajectories).double()
             each = (time.perf_counter() - begin) / costs.numel()
             needed[name] = float((each * costs.var(1) / (0.01 * costs.mean(1)).square()).mean())
             table.add(f"mean cost, {name} stage costs", float(costs.mean()), "cost")

@@ -5,8 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 import torch
+from tensordict import TensorDictBase
 
-from torchrl_pomdp.collectors import PartSampler, training_states
+from torchrl_pomdp.collectors import PartSampler, StateMemory, training_states
 from torchrl_pomdp.envs import CalibratedStart, Problem, RepairModel, RepairPartition, damage_chain, line, make_problem
 from torchrl_pomdp.modules import GreedyRepair, PartitionedPolicy
 from torchrl_pomdp.objectives import ClassificationLoss
@@ -25,14 +26,21 @@ def line_problem(size: int, drift: float = 0.0) -> tuple[RepairModel, Calibrated
     return model, CalibratedStart(model)
 
 
+def states(count: int, seed: int) -> TensorDictBase:
+    """Training states of all six parts, as policy iteration draws them."""
+    problem, memory = linear20(), StateMemory(linear20().model)
+    memory.visit(GreedyRepair(problem.model), problem.start, torch.arange(5000), exploration=0.15)
+    parts = {part: training_states(problem, memory, part) for part in range(6)}
+    return problem.model.with_features(PartSampler(parts, seed=seed)(torch.arange(count)))
+
+
 @cache
 def networks() -> PartitionedPolicy:
     """Six 256-64 networks that imitate the greedy policy, so that their rollouts have the usual lengths."""
     problem = linear20()
     greedy = GreedyRepair(problem.model)
     policy = make_networks(problem, PolicyIterationConfig(), seed=0)
-    parts = {part: training_states(problem, greedy, part) for part in range(6)}
-    y = problem.model.with_features(PartSampler(parts, seed=0)(torch.arange(60_000)))
+    y = states(60_000, seed=0)
     y.set("action", greedy(y.copy())["action"])
     y.set("q_factors", torch.nn.functional.one_hot(y["action"], 3) * -1.0)
     loss = ClassificationLoss(policy, "cross_entropy")

@@ -44,7 +44,7 @@ import torch
 from torchrl import logger
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_pomdp.collectors import PartSampler, RolloutImprovement, training_states
+from torchrl_pomdp.collectors import PartSampler, RolloutImprovement, StateMemory, training_states
 from torchrl_pomdp.envs import BeliefEnv, make_problem
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import GreedyRepair, PartitionedPolicy, PolicyNetwork, RelativeEncoder, RolloutPolicy
@@ -85,8 +85,8 @@ for belief, q, u in zip(y["belief"], y["q_factors"], y["action"], strict=True):
 #
 # `RolloutImprovement` labels states with their rollout control. The partition's *stages* tell in which order the parts are
 # trained: endgame states never lead back to the startgame, so the endgame networks come first and finish the simulations of
-# the startgame. Half of the states of a part are random, half are met by following the current policy. In the end the
-# networks are the next base policy.
+# the startgame. Half of the states of a part are random, half come from a memory of states that the policies have met. In the
+# end the networks are the next base policy.
 
 
 # %%
@@ -94,10 +94,11 @@ def improve(base: list, iteration: int) -> list:
     """One policy iteration: networks that imitate the rollout of the local policies ``base``, one for each part."""
     generator = torch.Generator().manual_seed(iteration)
     encoder = RelativeEncoder(model)
+    memory.visit(PartitionedPolicy(base), problem.start, torch.arange(2000) + 10_000 * iteration, exploration=0.15)
     networks = [PolicyNetwork(encoder, model.num_controls, generator=generator) for _ in partition.names]
     for number, stage in enumerate(partition.stages):
         policy = PartitionedPolicy(base)
-        generators = {part: training_states(problem, policy, part) for part in stage}
+        generators = {part: training_states(problem, memory, part) for part in stage}
         collector = RolloutImprovement(
             BeliefEnv(model, problem.start),
             policy,
@@ -122,6 +123,7 @@ def improve(base: list, iteration: int) -> list:
     return base
 
 
+memory = StateMemory(model)
 policies = [[greedy] * partition.num_parts]
 for iteration in range(ITERATIONS):
     policies.append(improve(policies[-1], iteration))
@@ -158,5 +160,6 @@ trajectory_figure(model, trajectory, "one trajectory of the last policy")
 # ## Where to go from here
 #
 # - `PROBLEM = "linear20"` with `SAMPLES_PER_PART = 10_000` takes some minutes and works the same way.
-# - `training_states` is built from `VisitedStates`, `InPart` and `Mixture`, which you can combine in other ways.
-# - `torchrl-pomdp train linear20` does all this under TorchRL's trainer, with checkpoints, metrics and pictures.
+# - `UrgencyRepair` is a better base policy than greedy, and `ParallelRollout` takes both.
+# - `training_states` is built from `StateMemory`, `InPart` and `Mixture`, which you can combine in other ways.
+# - `torchrl-pomdp train linear20` does all this under TorchRL's trainer, with values, checkpoints, metrics and pictures.
