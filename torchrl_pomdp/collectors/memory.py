@@ -10,7 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf, take_rows
-from torchrl_pomdp.modules.rollout import Policy, step_noise
+from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.noise import fold, uniform
 
 __all__ = ["StateMemory"]
@@ -115,17 +116,19 @@ class StateMemory:
         """The retained states of every step of the trajectories with the given keys."""
         model = self.model
         y = model.with_features(start(fold(keys, _START)))
+        scenarios = Scenarios.single(fold(keys, _STEPS))
         for step in range(max_steps):
             rest = (~model.is_terminal(y)).nonzero().squeeze(-1)
             if rest.numel() < keys.numel():
-                y, keys = take_rows(y, rest), keys[rest]
+                y, keys, scenarios = take_rows(y, rest), keys[rest], scenarios.rows(rest)
             if keys.numel() == 0:
                 return
             yield self._retained(y)
             u = policy(y.copy()).get("action")
             random = inverse_cdf(y.get("action_mask").to(torch.float32), uniform(fold(keys, _CONTROL), step))
             u = torch.where(uniform(fold(keys, _EXPLORE), step) < exploration, random, u)
-            _, y = model.advance(y, u, step_noise(fold(keys, _STEPS), step, model.noise_dim))
+            noise, scenarios = scenarios.draw(torch.full_like(keys, step), model.observed(y, u), 1)
+            _, y = model.advance(y, u, noise)
 
     def _retained(self, y: TensorDictBase) -> TensorDictBase:
         """The rows of ``y`` that are retained, with their priority and part."""

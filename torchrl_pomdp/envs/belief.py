@@ -167,6 +167,14 @@ class BeliefModel(nn.Module, ABC):
         z = inverse_cdf(self.observation_probs(y, u), noise[..., 0])
         return self.expected_cost(y, u), self.estimator(y, u, z)
 
+    def observed(self, y: TensorDictBase, u: Tensor) -> Tensor:
+        """Names of the hidden variables that control ``u`` ``[*B]`` lets be observed, int64 ``[*B, noise_dim]``, not negative.
+
+        Simulations compare controls under common random numbers: in one scenario, whoever observes a variable first finds
+        it in the same state, see :mod:`torchrl_pomdp.modules.scenarios`. One name for all: a single hidden variable.
+        """
+        return torch.zeros(*y.batch_size, self.noise_dim, dtype=torch.int64, device=self.device)
+
     def is_terminal(self, y: TensorDictBase) -> Tensor:
         """Bool ``[*B]``: no cost follows from here whatever is done. A discounted model need not have such states."""
         return torch.zeros(y.batch_size, dtype=torch.bool, device=self.device)

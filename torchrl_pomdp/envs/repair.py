@@ -244,6 +244,11 @@ class RepairModel(BeliefModel):
         cost = self._stage_cost(planes).view(y.batch_size)
         return cost, self._successor(y, self._next_planes(planes, location, levels), location)
 
+    def observed(self, y: TensorDictBase, u: Tensor) -> Tensor:
+        """The locations where the robots will stand, ``[*B, R]``."""
+        location, _ = self._move(y, u)
+        return location.T.reshape(*y.batch_size, self.num_robots)
+
     def observe(self, y: TensorDictBase, noise: Tensor) -> TensorDictBase:
         """Observe the levels where the robots stand, without a control: for start states.
 

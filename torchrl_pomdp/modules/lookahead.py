@@ -9,12 +9,13 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf, take_rows
+from torchrl_pomdp.envs.belief import BeliefModel, take_rows
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.modules.truncation import Truncation
-from torchrl_pomdp.noise import fold, uniform
+from torchrl_pomdp.noise import fold
 
 __all__ = ["RolloutPolicy"]
 
@@ -25,14 +26,19 @@ _CHUNKS_PER_BLOCK = 4
 _FIRST_ROUND, _NEXT_ROUND, _CLEARLY = 3, 1, 2.2
 
 
+# For every leaf its pair, the place of its trajectory, its state, scenario and weight.
+_Leaves = tuple[Tensor, Tensor, TensorDictBase, Scenarios, Tensor]
+
+
 class RolloutPolicy(TensorDictModuleBase):
     r"""The rollout policy: minimise the Q-factors of a base policy over the legal controls.
 
     .. math:: \tilde Q(y,u)=\hat g(y,u)+\alpha\sum_z\hat p(z\mid b_y,u)\,\tilde J\bigl(F(y,u,z)\bigr)
 
     with :math:`\tilde J` the mean cost of simulated trajectories of the base policy. All controls of a state are compared
-    under common random numbers: the noise of a trajectory is a function of (seed, state, trajectory, step) alone, the
-    state being identified by its content. Labels therefore do not depend on the batch, its order, or who computes them.
+    in the same scenarios (see :mod:`~torchrl_pomdp.modules.scenarios`), whose noise is a function of seed, state, trajectory,
+    and what is observed when, the state being identified by its content. Labels therefore do not depend on the batch, its
+    order, or who computes them.
 
     Args:
         model: the belief model.
@@ -130,9 +136,8 @@ class RolloutPolicy(TensorDictModuleBase):
     def _q_factors(self, y: TensorDictBase) -> Tensor:
         """Q-factors ``[N, U]`` of a flat batch."""
         mask, core = y.get("action_mask"), y.select(*self.model.state_keys)
-        each = torch.arange(self.trajectories, device=mask.device)
-        # [N, n]: one key for each state and trajectory, shared by the state's controls.
-        keys = fold(fold(self.model.fingerprint(core), self.seed).unsqueeze(-1), each)
+        # [N]: one key for each state, shared by its controls.
+        keys = fold(self.model.fingerprint(core), self.seed)
         costs = torch.full((self.trajectories, *mask.shape), torch.nan, dtype=self.model.dtype, device=mask.device)
         rivals, spent = mask, 0
         for count in self._rounds():
@@ -156,31 +161,41 @@ class RolloutPolicy(TensorDictModuleBase):
     def _trajectory_costs(self, core: TensorDictBase, state: Tensor, u: Tensor, members: Tensor, keys: Tensor) -> Tensor:
         r""":math:`\hat g(y,u)+\alpha\tilde J` of P state-control pairs for the trajectories ``members`` ``[n]``: ``[n, P]``."""
         model, pairs = self.model, take_rows(core, state)
-        pair, trajectory, observation, weight = self._leaves(model.observation_probs(pairs, u), members, keys[state])
-        successors = model.estimator(take_rows(pairs, pair), u[pair], observation)
-        cost = self.cost_to_go(successors, fold(keys[state[pair], members[trajectory]], 1)) * weight
+        leaves = self._enumerated if self.leaves == "observation" else self._stratified
+        pair, each, successors, scenarios, weight = leaves(pairs, u, members, keys[state])
+        cost = self.cost_to_go(successors, scenarios, self.trajectories) * weight
         total = torch.zeros(members.numel() * u.numel(), dtype=cost.dtype, device=cost.device)
-        total.index_add_(0, trajectory * u.numel() + pair, cost)
+        total.index_add_(0, each * u.numel() + pair, cost)
         return model.expected_cost(pairs, u) + model.discount * total.view(members.numel(), -1)
 
-    def _leaves(self, probs: Tensor, members: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """First observations of P pairs from their probabilities ``[P, Z]`` and keys ``[P, n]``.
+    def _scenarios(self, pair: Tensor, each: Tensor, members: Tensor, keys: Tensor) -> Scenarios:
+        """Scenarios of trajectory ``members[each]`` of the pairs ``pair``, whose states have the keys ``keys`` ``[P]``."""
+        member = members[each]
+        return Scenarios(fold(keys[pair], member), keys[pair], member, torch.zeros_like(pair))
 
-        Returns for every leaf its pair, the place of its trajectory in ``members``, the observation, and its weight.
-        """
-        count = members.numel()
-        if self.leaves == "observation":
-            pair, observation = (probs > 0).nonzero(as_tuple=True)
-            weight = probs[pair, observation]
-        else:
-            # Trajectory j draws from the j-th of all n equal slices of the distribution function.
-            noise = (members + uniform(keys[:, members], 0)) / self.trajectories
-            observation = inverse_cdf(probs.unsqueeze(1).expand(-1, count, -1), noise).flatten()
-            pair = torch.arange(probs.shape[0], device=probs.device).repeat_interleave(count)
-            each = torch.arange(count, device=probs.device).repeat(probs.shape[0])
-            return pair, each, observation, torch.ones_like(pair, dtype=probs.dtype)
-        each = torch.arange(count, device=probs.device).repeat(pair.numel())
-        return pair.repeat_interleave(count), each, observation.repeat_interleave(count), weight.repeat_interleave(count)
+    def _stratified(self, pairs: TensorDictBase, u: Tensor, members: Tensor, keys: Tensor) -> _Leaves:
+        """One leaf for every pair and trajectory: the first observation is the scenario's."""
+        model, device = self.model, u.device
+        pair = torch.arange(u.numel(), device=device).repeat_interleave(members.numel())
+        each = torch.arange(members.numel(), device=device).repeat(u.numel())
+        y, control = take_rows(pairs, pair), u[pair]
+        scenarios = self._scenarios(pair, each, members, keys)
+        # Ages count from the leaf; the step to it is the one before.
+        noise, scenarios = scenarios.draw(torch.full_like(pair, -1), model.observed(y, control), self.trajectories)
+        _, successors = model.advance(y, control, noise)
+        return pair, each, successors, scenarios, torch.ones((), dtype=model.dtype, device=device)
+
+    def _enumerated(self, pairs: TensorDictBase, u: Tensor, members: Tensor, keys: Tensor) -> _Leaves:
+        """A leaf for every pair, observation of positive probability and trajectory, weighted by the probability."""
+        model, device = self.model, u.device
+        probs = model.observation_probs(pairs, u)
+        pair, observation = (probs > 0).nonzero(as_tuple=True)
+        weight = probs[pair, observation].repeat_interleave(members.numel())
+        each = torch.arange(members.numel(), device=device).repeat(pair.numel())
+        pair, observation = pair.repeat_interleave(members.numel()), observation.repeat_interleave(members.numel())
+        y, control = take_rows(pairs, pair), u[pair]
+        scenarios = self._scenarios(pair, each, members, keys).observe(model.observed(y, control))
+        return pair, each, model.estimator(y, control, observation), scenarios, weight
 
 
 def _rivals(costs: Tensor, rivals: Tensor) -> Tensor:

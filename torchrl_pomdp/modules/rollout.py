@@ -12,10 +12,10 @@ from torch import Tensor, nn
 
 from torchrl_pomdp.envs.belief import BeliefModel, put_rows, take_rows
 from torchrl_pomdp.modules.compiling import compiled
+from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.truncation import Truncation
-from torchrl_pomdp.noise import uniform
 
-__all__ = ["Policy", "TerminalCost", "TruncatedRollout", "step_noise", "terminal_costs"]
+__all__ = ["Policy", "TerminalCost", "TruncatedRollout", "terminal_costs"]
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 """A policy writes ``"action"``, int64 ``[*B]``, into a TensorDict of feature states; any TensorDictModule with that key."""
@@ -26,12 +26,6 @@ them as ``"state_value"`` ``[*B]`` (costs, lower is better). ``in_keys``, where 
 
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
 _RENEW_FRACTION = 0.15
-
-
-def step_noise(keys: Tensor, step: int | Tensor, noise_dim: int) -> Tensor:
-    """Uniforms ``[*B, noise_dim]`` of one step, for all or for each of the trajectories with int64 ``keys`` ``[*B]``."""
-    first = step * noise_dim
-    return torch.stack([uniform(keys, first + i) for i in range(noise_dim)], -1)
 
 
 def terminal_costs(terminal_cost: TerminalCost, y: TensorDictBase) -> Tensor:
@@ -56,11 +50,11 @@ def terminal_costs(terminal_cost: TerminalCost, y: TensorDictBase) -> Tensor:
 class _Live(NamedTuple):
     """The trajectories that are simulated now.
 
-    Features, keys, number in the batch, steps made, whether it has ended, and what the truncation rule remembers.
+    Features, noise, number in the batch, steps made, whether it has ended, and what the truncation rule remembers.
     """
 
     y: TensorDictBase
-    keys: Tensor
+    scenarios: Scenarios
     number: Tensor
     age: Tensor
     ended: Tensor
@@ -68,11 +62,11 @@ class _Live(NamedTuple):
 
     def rows(self, chosen: Tensor) -> _Live:
         index = chosen.nonzero().squeeze(-1)
-        return _Live(take_rows(self.y, index), *(mine[index] for mine in self[1:]))
+        return _Live(take_rows(self.y, index), self.scenarios.rows(index), *(mine[index] for mine in self[2:]))
 
     def replace_rows(self, index: Tensor, other: _Live) -> _Live:
-        rest = (mine.index_copy(0, index, theirs) for mine, theirs in zip(self[1:], other[1:], strict=True))
-        return _Live(put_rows(self.y, index, other.y), *rest)
+        rest = (mine.index_copy(0, index, theirs) for mine, theirs in zip(self[2:], other[2:], strict=True))
+        return _Live(put_rows(self.y, index, other.y), self.scenarios.replace_rows(index, other.scenarios), *rest)
 
 
 class TruncatedRollout(nn.Module):
@@ -161,62 +155,68 @@ class TruncatedRollout(nn.Module):
         self._transition = compiled(self._policy_and_step) if compile else self._policy_and_step
         self.register_buffer("_discounts", powers.to(model.device, model.dtype), persistent=False)
 
-    def forward(self, y: TensorDictBase, keys: Tensor) -> Tensor:
+    def forward(self, y: TensorDictBase, keys: Tensor | Scenarios, count: int = 1) -> Tensor:
         """Cost of one trajectory from every row.
 
         Args:
             y: feature states ``[N]``.
-            keys: int64 ``[N]``; step k of a row uses the uniforms of its key with counter k.
+            keys: streams of the trajectories, int64 ``[N]``; or scenarios, to go on with.
+            count: with scenarios, the number of trajectories of an estimate.
 
         Returns:
             costs ``[N]``.
         """
-        total = torch.zeros(keys.shape, dtype=self.model.dtype, device=keys.device)
+        scenarios = keys if isinstance(keys, Scenarios) else Scenarios.single(keys)
+        total = torch.zeros(y.batch_size, dtype=self.model.dtype, device=self.model.device)
         with torch.inference_mode():
-            steps = self._simulate(y, keys, total)
+            steps = self._simulate(y, scenarios, count, total)
         with self._lock:
             self.simulated_steps += steps
         return total
 
-    def _simulate(self, y: TensorDictBase, keys: Tensor, total: Tensor) -> int:
+    def _simulate(self, y: TensorDictBase, scenarios: Scenarios, count: int, total: Tensor) -> int:
         """Add the cost of every trajectory to ``total`` ``[N]``; returns the number of belief steps."""
         steps = 0
-        live, waiting = self._admit(y, keys, 0, self.chunk_rows, total), self.chunk_rows
-        while live.keys.numel():
+        size, waiting = y.batch_size[0], self.chunk_rows
+        live = self._admit(y, scenarios, 0, waiting, total)
+        while live.number.numel():
             ended = int(live.ended.sum())
             if ended <= _RENEW_FRACTION * live.ended.numel():
-                live = self._step(live, total)
+                live = self._step(live, count, total)
                 steps += live.ended.numel() - ended
                 continue
-            free = live.ended.nonzero().squeeze(-1)[: max(0, keys.numel() - waiting)]
+            free = live.ended.nonzero().squeeze(-1)[: max(0, size - waiting)]
             if free.numel():
-                live = live.replace_rows(free, self._admit(y, keys, waiting, waiting + free.numel(), total))
+                live = live.replace_rows(free, self._admit(y, scenarios, waiting, waiting + free.numel(), total))
                 waiting += free.numel()
-            if waiting >= keys.numel():
+            if waiting >= size:
                 live = live.rows(~live.ended)
         return steps
 
-    def _admit(self, y: TensorDictBase, keys: Tensor, first: int, last: int, total: Tensor) -> _Live:
+    def _admit(self, y: TensorDictBase, scenarios: Scenarios, first: int, last: int, total: Tensor) -> _Live:
         """The trajectories number ``first`` to ``last``, at their start."""
-        number = torch.arange(first, min(last, keys.numel()), device=keys.device)
+        number = torch.arange(first, min(last, total.numel()), device=total.device)
         start = self.model.with_features(y[first:last].clone(), self._keys)
         age, memory = torch.zeros_like(number), number.new_zeros(number.numel(), 0)
         if self.truncation is not None:
             memory = self.truncation.start(self.model.with_features(start))
-        fresh = _Live(start, keys[first:last].clone(), number, age, torch.zeros_like(number, dtype=torch.bool), memory)
-        return self._end(fresh, total)
+        ended = torch.zeros_like(number, dtype=torch.bool)
+        return self._end(_Live(start, scenarios.rows(number), number, age, ended, memory), total)
 
-    def _step(self, live: _Live, total: Tensor) -> _Live:
+    def _step(self, live: _Live, count: int, total: Tensor) -> _Live:
         """One step of all live trajectories; those that have ended add no cost and grow no older."""
-        cost, y = self._transition(live.y, live.keys, live.age)
+        cost, y, scenarios = self._transition(live.y, live.scenarios, live.age, count)
         total.index_add_(0, live.number, cost.masked_fill(live.ended, 0.0))
-        return self._end(live._replace(y=y, age=live.age + ~live.ended), total)
+        return self._end(live._replace(y=y, scenarios=scenarios, age=live.age + ~live.ended), total)
 
-    def _policy_and_step(self, y: TensorDictBase, keys: Tensor, age: Tensor) -> tuple[Tensor, TensorDictBase]:
-        """Discounted stage cost ``[N]`` and next feature states of rows that have made ``age`` ``[N]`` steps."""
+    def _policy_and_step(
+        self, y: TensorDictBase, scenarios: Scenarios, age: Tensor, count: int
+    ) -> tuple[Tensor, TensorDictBase, Scenarios]:
+        """Discounted stage cost ``[N]``, next feature states and scenarios of rows that have made ``age`` ``[N]`` steps."""
         u = self.base_policy(y).get("action")
-        cost, nxt = self.model.advance(y, u, step_noise(keys, age, self.model.noise_dim))
-        return cost * self._discounts[age], nxt
+        noise, scenarios = scenarios.draw(age, self.model.observed(y, u), count)
+        cost, nxt = self.model.advance(y, u, noise)
+        return cost * self._discounts[age], nxt, scenarios
 
     def _end(self, live: _Live, total: Tensor) -> _Live:
         """End the trajectories that are in a terminal state or cut; the cut ones get the terminal cost, once."""

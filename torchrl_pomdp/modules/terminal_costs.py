@@ -14,6 +14,7 @@ from torchrl_pomdp.envs.partition import location_costs
 from torchrl_pomdp.envs.repair import RepairModel
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold
@@ -184,8 +185,8 @@ class PolicyCost(TensorDictModuleBase):
     def _costs(self, y: TensorDictBase) -> Tensor:
         """Costs ``[N]`` of a flat batch."""
         count = self.trajectories
-        each = torch.arange(count, device=y.device)
-        # [n, N]: one key for each trajectory and state.
-        keys = fold(fold(self.model.fingerprint(y), self.seed), each.unsqueeze(-1))
+        groups = fold(self.model.fingerprint(y), self.seed).repeat(count)
+        members = torch.arange(count, device=y.device).repeat_interleave(y.shape[0])
+        scenarios = Scenarios(fold(groups, members), groups, members, torch.zeros_like(groups))
         rows = take_rows(y, torch.arange(y.shape[0], device=y.device).repeat(count))
-        return sum_first(self.rollout(rows, keys.flatten()).view(count, -1)) / count
+        return sum_first(self.rollout(rows, scenarios, count).view(count, -1)) / count
