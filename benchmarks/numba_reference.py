@@ -11,7 +11,7 @@ _FIRST, _SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 @numba.njit(inline="always")
 def _uniform(key, counter):
-    x = key + np.uint64(counter + 1) * _GOLDEN
+    x = key + (counter + np.uint64(1)) * _GOLDEN
     x = (x ^ (x >> np.uint64(30))) * _FIRST
     x = (x ^ (x >> np.uint64(27))) * _SECOND
     x = x ^ (x >> np.uint64(31))
@@ -38,7 +38,7 @@ def greedy_rollout(beliefs, places, keys, rise, costs, discount, max_steps, term
     total = np.zeros(count, np.float32)
     steps = 0
     for row in range(count):
-        belief, place, weight = beliefs[row], places[row], np.float32(1.0)
+        belief, place, weight, seen = beliefs[row], places[row], np.float32(1.0), np.uint64(0)
         for step in range(max_steps):
             intact = np.float32(1.0)
             for location in range(size):
@@ -61,11 +61,15 @@ def greedy_rollout(beliefs, places, keys, rise, costs, discount, max_steps, term
             weight *= discount
             place += control
             observed = 0
+            bit = np.uint64(1) << np.uint64(place % 63)
             if control != 0:
-                threshold, cumulative = _uniform(keys[row], step), belief[0, place]
+                # The first observation of a location is the scenario's, later ones are the step's.
+                counter = np.uint64(place) if seen & bit == 0 else np.uint64(1 << 32) + np.uint64(step)
+                threshold, cumulative = _uniform(keys[row], counter), belief[0, place]
                 while observed < levels - 1 and cumulative <= threshold:
                     observed += 1
                     cumulative += belief[observed, place]
+            seen |= bit
             for level in range(levels):
                 belief[level, place] = np.float32(1.0) if level == observed else np.float32(0.0)
     return total, steps

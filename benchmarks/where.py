@@ -14,6 +14,7 @@ from benchmarks.setting import linear20, networks
 from torchrl_pomdp.envs import RepairModel
 from torchrl_pomdp.modules import GreedyRepair, PartitionedPolicy, TruncatedRollout
 from torchrl_pomdp.modules import rollout as rollout_module
+from torchrl_pomdp.modules.scenarios import Scenarios
 
 _PARTS = {
     "policy": [(GreedyRepair, "forward"), (PartitionedPolicy, "forward")],
@@ -21,7 +22,7 @@ _PARTS = {
     "cost": [(RepairModel, "_stage_cost")],
     "observation": [(RepairModel, "_draw_levels"), (RepairModel, "_columns")],
     "belief update": [(RepairModel, "_next_planes")],
-    "noise": [(rollout_module, "step_noise")],
+    "noise": [(Scenarios, "draw"), (RepairModel, "observed")],
     "end of trajectories": [
         (RepairModel, "is_terminal"),
         (rollout_module._Live, "replace_rows"),

@@ -9,6 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_pomdp.envs import BeliefEnv, FixedBelief, make_problem, tiger
 from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout
+from torchrl_pomdp.modules.scenarios import Scenarios
 
 
 def repair_env(batch_size=(), seed=0):
@@ -72,7 +73,7 @@ def test_environment_and_engine_walk_the_same_trajectory(linear20, monkeypatch):
     rollout = env.rollout(20, greedy, tensordict=y.clone(), auto_reset=False, break_when_any_done=False)
     cost = -(rollout["next", "reward"].squeeze(-1) * model.discount ** torch.arange(20)).sum(1)
 
-    monkeypatch.setattr("torchrl_pomdp.modules.rollout.step_noise", lambda keys, step, dim: torch.stack(noise)[step, keys])
+    monkeypatch.setattr(Scenarios, "draw", lambda self, age, names, count: (torch.stack(noise)[age, self.keys], self))
     engine = TruncatedRollout(model, greedy, max_steps=20)(y, torch.arange(16))
     torch.testing.assert_close(engine, cost, rtol=1e-5, atol=0)
     state = model.with_features(y)

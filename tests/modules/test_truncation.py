@@ -16,7 +16,7 @@ from torchrl_pomdp.envs import RepairModel, RepairPartition, TabularModel, damag
 from torchrl_pomdp.envs.belief import take_rows
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.modules import AfterSteps, GreedyRepair, OnEntering, OnLeaving, RolloutPolicy, TruncatedRollout
-from torchrl_pomdp.modules.rollout import step_noise
+from torchrl_pomdp.modules.scenarios import Scenarios
 
 
 class MostLikely(Partition):
@@ -95,12 +95,13 @@ def test_a_trajectory_that_waits_long_after_its_end_adds_nothing():
 def naive_cost(model, policy, y, key, stop, terminal_cost, max_steps):
     """Cost and steps of one trajectory, written down as the paper says it; ``stop(y, age, start)`` is the rule."""
     y = start = model.with_features(y.reshape(1))
-    total, age = 0.0, 0
+    total, age, scenario = 0.0, 0, Scenarios.single(key)
     while not model.is_terminal(y):
         if age == max_steps or stop(y, age, start):
             return total + model.discount**age * float(terminal_cost(y)), age
         u = policy(y.copy())["action"]
-        cost, y = model.advance(y, u, step_noise(key, age, model.noise_dim))
+        noise, scenario = scenario.draw(torch.tensor([age]), model.observed(y, u), 1)
+        cost, y = model.advance(y, u, noise)
         total, age = total + model.discount**age * float(cost), age + 1
     return total, age
 
