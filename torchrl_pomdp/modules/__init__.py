@@ -3,6 +3,7 @@
 from torchrl_pomdp.modules.base_policies import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder, RelativeEncoder
 from torchrl_pomdp.modules.lookahead import RolloutPolicy
+from torchrl_pomdp.modules.multistep import MultistepLookahead
 from torchrl_pomdp.modules.networks import PolicyNetwork, ValueNetwork
 from torchrl_pomdp.modules.parallel import ParallelRollout
 from torchrl_pomdp.modules.partitioned import PartitionedPolicy, PartitionedValue
@@ -16,6 +17,7 @@ __all__ = [
     "Encoder",
     "FlatEncoder",
     "GreedyRepair",
+    "MultistepLookahead",
     "NeverRepairCost",
     "OnEntering",
     "OnLeaving",

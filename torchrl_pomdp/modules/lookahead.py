@@ -119,25 +119,35 @@ class RolloutPolicy(TensorDictModuleBase):
         q = self.q_factors(tensordict)
         return tensordict.update({"action": q.argmin(-1), "q_factors": q})
 
+    def keys(self, y: TensorDictBase) -> Tensor:
+        """Keys of the scenarios of feature states, int64 ``[*B]``: functions of seed and content."""
+        return fold(self.model.fingerprint(y), self.seed)
+
     @torch.no_grad()
-    def q_factors(self, y: TensorDictBase) -> Tensor:
-        r""":math:`\tilde Q(y,u)` ``[*B, U]``, ``+inf`` where the control is illegal."""
+    def q_factors(self, y: TensorDictBase, keys: Tensor | None = None) -> Tensor:
+        r""":math:`\tilde Q(y,u)` ``[*B, U]``, ``+inf`` where the control is illegal.
+
+        Args:
+            y: feature states ``[*B]``.
+            keys: keys of their scenarios ``[*B]``, for states that shall share them; by default those of :meth:`keys`.
+        """
         self.model.check_state(y)
         shape = (*y.batch_size, self.model.num_controls)
         if y.batch_size.numel() == 0:
             return torch.zeros(shape, dtype=self.model.dtype, device=self.model.device)
         flat = self.model.with_features(y, ("action_mask",)).reshape(-1)
         branches = self.model.num_controls * (self.model.num_observations if self.leaves == "observation" else 1)
+        branches *= max(self._rounds())
         threads = torch.get_num_threads() if flat.device is None or flat.device.type == "cpu" else 1
-        size = max(1, _CHUNKS_PER_BLOCK * self.cost_to_go.chunk_rows // (self.trajectories * branches))
+        size = max(1, _CHUNKS_PER_BLOCK * self.cost_to_go.chunk_rows // branches)
         size = min(size, -(-flat.shape[0] // threads))
-        return torch.cat(map_threads(self._q_factors, flat.split(size), threads)).view(shape)
+        keys = self.keys(flat) if keys is None else keys.reshape(-1)
+        blocks = list(zip(flat.split(size), keys.split(size), strict=True))
+        return torch.cat(map_threads(lambda block: self._q_factors(*block), blocks, threads)).view(shape)
 
-    def _q_factors(self, y: TensorDictBase) -> Tensor:
-        """Q-factors ``[N, U]`` of a flat batch."""
+    def _q_factors(self, y: TensorDictBase, keys: Tensor) -> Tensor:
+        """Q-factors ``[N, U]`` of a flat batch with the keys ``[N]``."""
         mask, core = y.get("action_mask"), y.select(*self.model.state_keys)
-        # [N]: one key for each state, shared by its controls.
-        keys = fold(self.model.fingerprint(core), self.seed)
         costs = torch.full((self.trajectories, *mask.shape), torch.nan, dtype=self.model.dtype, device=mask.device)
         rivals, spent = mask, 0
         for count in self._rounds():

@@ -1,0 +1,115 @@
+r"""Multistep lookahead: an :math:`\ell`-step problem with rollout at its end (paper, Sections II and III)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_pomdp.envs.belief import inverse_cdf, take_rows
+from torchrl_pomdp.modules.lookahead import RolloutPolicy
+from torchrl_pomdp.noise import fold, uniform
+
+__all__ = ["MultistepLookahead"]
+
+# Root states that are expanded at once.
+_BLOCK = 256
+
+
+class MultistepLookahead(TensorDictModuleBase):
+    r"""Lookahead over several steps, minimising over the tree; the last step is one-step lookahead with rollout.
+
+    .. math:: Q_\ell(y,u)=\hat g(y,u)+\alpha\sum_z\hat p(z\mid b_y,u)\,\min_{u'}Q_{\ell-1}\bigl(F(y,u,z),u'\bigr)
+
+    with :math:`Q_1` of the rollout policy. Illegal controls, observations of probability zero and terminal states are not
+    expanded; equal states of a tree are expanded once. All states of a tree share their scenarios.
+
+    Args:
+        policy: the rollout policy of the last step.
+        depth: :math:`\ell`, 1 to 3.
+        branches: up to so many observations of a control are expanded exactly; of more, so many are drawn, stratified.
+
+    Raises:
+        ValueError: if ``depth`` is not 1, 2 or 3, or ``branches`` is not positive.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> problem = make_problem("line3")
+        >>> policy = MultistepLookahead(RolloutPolicy(problem.model, GreedyRepair(problem.model)), depth=2)
+        >>> policy(problem.start(torch.arange(4)))["q_factors"].shape
+        torch.Size([4, 3])
+    """
+
+    out_keys = ["action", "q_factors"]
+
+    def __init__(self, policy: RolloutPolicy, depth: int = 2, branches: int = 5) -> None:
+        super().__init__()
+        if depth not in (1, 2, 3):
+            raise ValueError(f"depth must be 1, 2 or 3, got {depth}")
+        if branches < 1:
+            raise ValueError(f"branches must be at least 1, got {branches}")
+        self.policy, self.depth, self.branches = policy, depth, branches
+        self.model, self.in_keys = policy.model, policy.in_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"q_factors"`` ``[*B, U]`` (costs, ``+inf`` where illegal) and ``"action"`` ``[*B]`` (ties to the lower)."""
+        q = self.q_factors(tensordict)
+        return tensordict.update({"action": q.argmin(-1), "q_factors": q})
+
+    @torch.no_grad()
+    def q_factors(self, y: TensorDictBase) -> Tensor:
+        r""":math:`Q_\ell(y,u)` ``[*B, U]``, ``+inf`` where the control is illegal."""
+        self.model.check_state(y)
+        flat = y.select(*self.model.state_keys).reshape(-1)
+        if flat.batch_size[0] == 0:
+            return self.policy.q_factors(y)
+        q = [self._expand(block, self.policy.keys(block), self.depth) for block in flat.split(_BLOCK)]
+        return torch.cat(q).view(*y.batch_size, -1)
+
+    def _expand(self, y: TensorDictBase, keys: Tensor, depth: int) -> Tensor:
+        """Q-factors ``[N, U]`` of states whose trees have the keys ``keys`` ``[N]``."""
+        if depth == 1:
+            return self.policy.q_factors(y, keys)
+        model, mask = self.model, self.model.action_mask(y)
+        state, u = mask.nonzero(as_tuple=True)
+        pairs = take_rows(y, state)
+        pair, observation, weight = self._observations(model.observation_probs(pairs, u), fold(keys[state], depth))
+        successors = model.estimator(take_rows(pairs, pair), u[pair], observation)
+        value = self._values(successors, keys[state[pair]], depth - 1)
+        # [P, branches]: summed in a fixed order.
+        ranks = torch.arange(pair.numel(), device=u.device) - torch.searchsorted(pair, pair)
+        terms = value.new_zeros(int(ranks.max()) + 1, u.numel())
+        terms[ranks, pair] = weight * value
+        total = terms[0]
+        for term in terms[1:]:
+            total = total + term
+        q = torch.full(mask.shape, torch.inf, dtype=value.dtype, device=value.device)
+        q[state, u] = model.expected_cost(pairs, u) + model.discount * total
+        return q
+
+    def _observations(self, probs: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Pairs, observations and weights of the branches of P pairs with distributions ``probs`` ``[P, Z]``."""
+        many = (probs > 0).sum(-1) > self.branches
+        pair, observation = ((probs > 0) & ~many.unsqueeze(-1)).nonzero(as_tuple=True)
+        each = torch.arange(self.branches, device=probs.device)
+        rows = many.nonzero().squeeze(-1)
+        noise = (each + uniform(keys[rows].unsqueeze(-1), each)) / self.branches
+        drawn = inverse_cdf(probs[rows].unsqueeze(1).expand(-1, self.branches, -1), noise.clamp_max(1.0 - 2.0**-24))
+        pair = torch.cat([pair, rows.repeat_interleave(self.branches)])
+        weight = torch.cat([probs[(probs > 0) & ~many.unsqueeze(-1)], probs.new_full((drawn.numel(),), 1.0 / self.branches)])
+        order = pair.argsort(stable=True)
+        return pair[order], torch.cat([observation, drawn.flatten()])[order], weight[order]
+
+    def _values(self, y: TensorDictBase, keys: Tensor, depth: int) -> Tensor:
+        """Smallest Q-factors ``[N]``, zero at terminal states; equal states of a tree are expanded once."""
+        value = torch.zeros(keys.shape, dtype=self.model.dtype, device=keys.device)
+        live = (~self.model.is_terminal(y)).nonzero().squeeze(-1)
+        if live.numel() == 0:
+            return value
+        same, inverse = fold(keys[live], self.model.fingerprint(y)[live]).unique(return_inverse=True)
+        place = torch.empty_like(same).scatter_(0, inverse, torch.arange(live.numel(), device=same.device))
+        chosen = live[place]
+        value[live] = self._expand(take_rows(y, chosen), keys[chosen], depth).amin(-1)[inverse]
+        return value
