@@ -86,7 +86,7 @@ def settings_config(settings: Literal["paper", "tuned"], problem: str, scale: fl
     samples = max(1, round(scale * _SAMPLES.get(problem, _MORE_SAMPLES)))
     common = PolicyIterationConfig(samples_per_part=samples, value_samples=samples, seed=seed)
     if settings == "tuned":
-        return replace(common, iterations=3, epochs=8)
+        return replace(common, iterations=2, epochs=8, trajectories=5)
     return replace(
         common,
         iterations=2,
