@@ -13,15 +13,13 @@ from torchrl_pomdp.envs.belief import BeliefModel, take_rows
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
-from torchrl_pomdp.modules.threads import map_threads
+from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold
 
 __all__ = ["RolloutPolicy"]
 
 _LEAVES, _ALLOCATIONS = ("control", "observation"), ("uniform", "adaptive")
-# Leaves that are made at once, in chunks of the rollout: enough to keep its chunk full nearly all the time.
-_CHUNKS_PER_BLOCK = 4
 # Adaptive allocation: trajectories of the first and of every further round, and the standard errors that settle it.
 _FIRST_ROUND, _NEXT_ROUND, _CLEARLY = 3, 1, 2.2
 
@@ -136,14 +134,12 @@ class RolloutPolicy(TensorDictModuleBase):
         if y.batch_size.numel() == 0:
             return torch.zeros(shape, dtype=self.model.dtype, device=self.model.device)
         flat = self.model.with_features(y, ("action_mask",)).reshape(-1)
-        branches = self.model.num_controls * (self.model.num_observations if self.leaves == "observation" else 1)
-        branches *= max(self._rounds())
-        threads = torch.get_num_threads() if flat.device is None or flat.device.type == "cpu" else 1
-        size = max(1, _CHUNKS_PER_BLOCK * self.cost_to_go.chunk_rows // branches)
-        size = min(size, -(-flat.shape[0] // threads))
+        leaves = self.model.num_controls * (self.model.num_observations if self.leaves == "observation" else 1)
+        trajectories = leaves * max(self._rounds())
+        size, threads = blocks(flat.shape[0], trajectories, self.cost_to_go.chunk_rows, self.model.device)
         keys = self.keys(flat) if keys is None else keys.reshape(-1)
-        blocks = list(zip(flat.split(size), keys.split(size), strict=True))
-        return torch.cat(map_threads(lambda block: self._q_factors(*block), blocks, threads)).view(shape)
+        parts = list(zip(flat.split(size), keys.split(size), strict=True))
+        return torch.cat(map_threads(lambda part: self._q_factors(*part), parts, threads)).view(shape)
 
     def _q_factors(self, y: TensorDictBase, keys: Tensor) -> Tensor:
         """Q-factors ``[N, U]`` of a flat batch with the keys ``[N]``."""

@@ -15,14 +15,11 @@ from torchrl_pomdp.envs.repair import RepairModel
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
-from torchrl_pomdp.modules.threads import map_threads
+from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold
 
 __all__ = ["ClosedFormCost", "NeverRepairCost", "PolicyCost", "SteadyStateCost", "ZeroCost"]
-
-# Trajectories that are made at once, in chunks of the rollout: enough to keep its chunk full nearly all the time.
-_CHUNKS_PER_BLOCK = 4
 
 
 class ClosedFormCost(TensorDictModuleBase):
@@ -177,9 +174,7 @@ class PolicyCost(TensorDictModuleBase):
         if y.batch_size.numel() == 0:
             return torch.zeros(y.batch_size, dtype=self.model.dtype, device=self.model.device)
         flat = self.model.with_features(y, self.model.state_keys).reshape(-1)
-        threads = torch.get_num_threads() if self.model.device.type == "cpu" else 1
-        size = max(1, _CHUNKS_PER_BLOCK * self.rollout.chunk_rows // self.trajectories)
-        size = min(size, -(-flat.shape[0] // threads))
+        size, threads = blocks(flat.shape[0], self.trajectories, self.rollout.chunk_rows, self.model.device)
         return torch.cat(map_threads(self._costs, flat.split(size), threads)).view(y.batch_size)
 
     def _costs(self, y: TensorDictBase) -> Tensor:

@@ -12,10 +12,31 @@ from typing import TypeVar
 
 import torch
 
-__all__ = ["map_threads"]
+__all__ = ["blocks", "map_threads"]
+
+# Trajectories that are made at once, in chunks of the rollout: enough to keep its chunk full nearly all the time.
+_CHUNKS_PER_BLOCK = 4
+
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+def blocks(states: int, trajectories: int, chunk_rows: int, device: torch.device) -> tuple[int, int]:
+    """States to simulate at once, and the number of threads that do so side by side.
+
+    Args:
+        states: number of states, at least 1.
+        trajectories: trajectories of each.
+        chunk_rows: trajectories in a chunk of the rollout.
+        device: where it computes; only a CPU has several threads.
+
+    Examples:
+        >>> blocks(10_000, 8, 1024, torch.device("meta"))
+        (512, 1)
+    """
+    threads = torch.get_num_threads() if device.type == "cpu" else 1
+    return min(max(1, _CHUNKS_PER_BLOCK * chunk_rows // trajectories), -(-states // threads)), threads
 
 
 def map_threads(function: Callable[[_Item], _Result], items: Sequence[_Item], threads: int) -> list[_Result]:

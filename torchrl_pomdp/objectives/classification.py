@@ -10,7 +10,8 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule
+
+from torchrl_pomdp.objectives.labels import LabelLoss
 
 __all__ = ["ClassificationLoss"]
 
@@ -19,7 +20,7 @@ LossName = Literal["soft", "cross_entropy", "cost_weighted", "l2"]
 _TEMPERATURE = 0.1
 
 
-class ClassificationLoss(LossModule):
+class ClassificationLoss(LabelLoss):
     r"""Loss of a masked policy network against labels :math:`(y^s,u^s)` with Q-factors.
 
     * ``"soft"``: cross-entropy with the targets softmax(-gap/τ), τ a tenth of the state's sum of gaps. Controls that are
@@ -68,21 +69,13 @@ class ClassificationLoss(LossModule):
         super().__init__()
         if loss not in _LOSSES:
             raise ValueError(f"loss must be one of {sorted(_LOSSES)}, got {loss!r}")
-        self._in_keys: list[NestedKey] | None = None
         self.loss = loss
         self.convert_to_functional(policy, "policy")
 
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        pass
-
     @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` reads."""
-        return [*self.policy.in_keys, self.tensor_keys.action, self.tensor_keys.q_factors]
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+    def network(self) -> TensorDictModuleBase:
+        """The module that is trained."""
+        return self.policy
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

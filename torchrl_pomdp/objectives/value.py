@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
-from torchrl.objectives import LossModule
 
 from torchrl_pomdp.modules import ClosedFormCost
+from torchrl_pomdp.objectives.labels import LabelLoss
 
 __all__ = ["ValueLoss"]
 
 
-class ValueLoss(LossModule):
+class ValueLoss(LabelLoss):
     r"""Mean squared error of a cost approximation :math:`\hat J(y,r)` against simulated costs, relative to a scale.
 
     Costs-to-go span many orders of magnitude; divided by a known positive cost of the state, such as that of never
@@ -52,21 +52,13 @@ class ValueLoss(LossModule):
 
     def __init__(self, value: TensorDictModuleBase, scale: ClosedFormCost) -> None:
         super().__init__()
-        self._in_keys: list[NestedKey] | None = None
         self.scale = scale
         self.convert_to_functional(value, "value")
 
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        pass
-
     @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` reads."""
-        return [*self.value.in_keys, self.tensor_keys.cost_to_go]
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+    def network(self) -> TensorDictModuleBase:
+        """The module that is trained."""
+        return self.value
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
