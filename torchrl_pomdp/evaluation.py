@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
@@ -78,7 +79,7 @@ def discounted_costs(
         num_states: number of start states.
         seed: seed of the start states and of the noise.
         max_steps: stages after which a trajectory is cut.
-        progress: whether to show a progress bar.
+        progress: whether to show a progress bar, which counts decisions.
         name: label of the progress bar.
 
     Returns:
@@ -97,14 +98,22 @@ def discounted_costs(
     """
     if num_states < 1:
         raise ValueError(f"num_states must be at least 1, got {num_states}")
-    cost = TruncatedRollout(model, policy, max_steps=max_steps)
     keys = seed_keys(seed, torch.arange(num_states, device=model.device))
-    blocks = []
-    with tqdm(total=num_states, unit="state", desc=name, disable=not progress, leave=False) as bar:
-        for block in keys.split(250):
-            blocks.append(cost(start(fold(block, 0)), fold(block, 1)))
-            bar.update(block.numel())
-    return torch.cat(blocks)
+    with tqdm(unit="step", unit_scale=True, desc=name, disable=not progress, leave=False) as bar:
+        cost = TruncatedRollout(model, _Watched(policy, bar), max_steps=max_steps)
+        return cost(start(fold(keys, 0)), fold(keys, 1))
+
+
+class _Watched:
+    """A policy whose decisions a progress bar counts."""
+
+    def __init__(self, policy: Policy, bar: tqdm) -> None:
+        self.policy, self.bar = policy, bar
+        self.in_keys = getattr(policy, "in_keys", ())
+
+    def __call__(self, y: TensorDictBase) -> TensorDictBase:
+        self.bar.update(y.batch_size.numel())
+        return self.policy(y)
 
 
 def estimate(values: Tensor) -> Estimate:

@@ -56,6 +56,41 @@ def test_two_steps_are_at_least_as_good_as_one_on_the_line_of_3(line3):
     assert two < line3_cost(model, GreedyRepair(model))[0] - 10
 
 
+def test_dominated_controls_are_pruned(line3):
+    """By hand: which controls are kept, what they are worth then, and that pruning saves simulations."""
+    model = small_model(line(3))
+    y = random_states(model, 40, seed=3)
+    one, margin = at_once(model).q_factors(y), 0.05
+    kept = one <= 1.05 * one.amin(-1, keepdim=True)
+    assert 0 < int((~kept & torch.isfinite(one)).sum())
+    pruned = MultistepLookahead(at_once(model), 2, branches=3, margin=margin).q_factors(y)
+    assert torch.equal(torch.isfinite(pruned), kept)
+    for row, keep, q in zip(y.split(1), kept, pruned, strict=True):
+        for u in keep.nonzero().flatten().tolist():
+            control = torch.tensor([u])
+            total = float(model.expected_cost(row, control))
+            for z, p in enumerate(model.observation_probs(row, control)[0].tolist()):
+                nxt = model.estimator(row, control, torch.tensor([z]))
+                if p > 0 and not model.is_terminal(nxt):
+                    total += model.discount * p * float(at_once(model).q_factors(nxt).min())
+            assert float(q[u]) == pytest.approx(total, rel=1e-4)
+    y = line3.start(torch.arange(50))
+    steps, actions = [], []
+    for margin in (None, 1e6, 0.02):
+        rollout = RolloutPolicy(line3.model, GreedyRepair(line3.model), trajectories=10)
+        actions.append(MultistepLookahead(rollout, 3, margin=margin)(y.clone())["action"])
+        steps.append(rollout.simulated_steps)
+    assert torch.equal(actions[0], actions[1])
+    assert steps[2] < 0.7 * steps[0]
+
+
+def test_two_steps_with_pruning_are_at_least_as_good_as_one_on_the_line_of_3(line3):
+    model = line3.model
+    rollout = RolloutPolicy(model, GreedyRepair(model), trajectories=20)
+    one, two = (line3_cost(model, Memo(model, p))[0] for p in (rollout, MultistepLookahead(rollout, 2, margin=0.1)))
+    assert LINE3_OPTIMUM[0] - 0.05 <= two <= one + 0.3
+
+
 def test_decisions_do_not_depend_on_the_batch(linear20):
     y = linear20.start(torch.arange(6))
     policy = MultistepLookahead(RolloutPolicy(linear20.model, GreedyRepair(linear20.model), trajectories=2), 2, branches=3)
@@ -99,3 +134,5 @@ def test_bad_arguments_are_refused(line3):
         MultistepLookahead(rollout, 4)
     with pytest.raises(ValueError, match="branches must be at least 1, got 0"):
         MultistepLookahead(rollout, 2, branches=0)
+    with pytest.raises(ValueError, match="margin must not be negative, got -0.1"):
+        MultistepLookahead(rollout, 2, margin=-0.1)

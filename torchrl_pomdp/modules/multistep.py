@@ -23,15 +23,19 @@ class MultistepLookahead(TensorDictModuleBase):
     .. math:: Q_\ell(y,u)=\hat g(y,u)+\alpha\sum_z\hat p(z\mid b_y,u)\,\min_{u'}Q_{\ell-1}\bigl(F(y,u,z),u'\bigr)
 
     with :math:`Q_1` of the rollout policy. Illegal controls, observations of probability zero and terminal states are not
-    expanded; equal states of a tree are expanded once. All states of a tree share their scenarios.
+    expanded; equal states of a tree are expanded once. All states of a tree share their scenarios. Controls that are clearly
+    inferior by their one-step Q-factors can be left out as well, see ``margin``.
 
     Args:
         policy: the rollout policy of the last step.
         depth: :math:`\ell`, 1 to 3.
         branches: up to so many observations of a control are expanded exactly; of more, so many are drawn, stratified.
+        margin: a control is dominated, and not expanded, if its :math:`Q_1` exceeds the smallest one by more than this
+            fraction of it. The preliminary Q-factors cost a step of rollout for every state that is expanded. None: all legal
+            controls are expanded.
 
     Raises:
-        ValueError: if ``depth`` is not 1, 2 or 3, or ``branches`` is not positive.
+        ValueError: if ``depth`` is not 1, 2 or 3, ``branches`` is not positive, or ``margin`` is negative.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -44,23 +48,25 @@ class MultistepLookahead(TensorDictModuleBase):
 
     out_keys = ["action", "q_factors"]
 
-    def __init__(self, policy: RolloutPolicy, depth: int = 2, branches: int = 5) -> None:
+    def __init__(self, policy: RolloutPolicy, depth: int = 2, branches: int = 5, margin: float | None = None) -> None:
         super().__init__()
         if depth not in (1, 2, 3):
             raise ValueError(f"depth must be 1, 2 or 3, got {depth}")
         if branches < 1:
             raise ValueError(f"branches must be at least 1, got {branches}")
-        self.policy, self.depth, self.branches = policy, depth, branches
+        if margin is not None and not margin >= 0.0:
+            raise ValueError(f"margin must not be negative, got {margin}")
+        self.policy, self.depth, self.branches, self.margin = policy, depth, branches, margin
         self.model, self.in_keys = policy.model, policy.in_keys
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``"q_factors"`` ``[*B, U]`` (costs, ``+inf`` where illegal) and ``"action"`` ``[*B]`` (ties to the lower)."""
+        """Write ``"q_factors"`` ``[*B, U]``, see :meth:`q_factors`, and ``"action"`` ``[*B]`` (ties to the lower)."""
         q = self.q_factors(tensordict)
         return tensordict.update({"action": q.argmin(-1), "q_factors": q})
 
     @torch.no_grad()
     def q_factors(self, y: TensorDictBase) -> Tensor:
-        r""":math:`Q_\ell(y,u)` ``[*B, U]``, ``+inf`` where the control is illegal."""
+        r""":math:`Q_\ell(y,u)` ``[*B, U]``, costs; ``+inf`` where the control is illegal or, with a margin, dominated."""
         self.model.check_state(y)
         flat = y.select(*self.model.state_keys).reshape(-1)
         if flat.batch_size[0] == 0:
@@ -72,7 +78,7 @@ class MultistepLookahead(TensorDictModuleBase):
         """Q-factors ``[N, U]`` of states whose trees have the keys ``keys`` ``[N]``."""
         if depth == 1:
             return self.policy.q_factors(y, keys)
-        model, mask = self.model, self.model.action_mask(y)
+        model, mask = self.model, self._worthwhile(y, keys)
         state, u = mask.nonzero(as_tuple=True)
         pairs = take_rows(y, state)
         pair, observation, weight = self._observations(model.observation_probs(pairs, u), fold(keys[state], depth))
@@ -88,6 +94,14 @@ class MultistepLookahead(TensorDictModuleBase):
         q = torch.full(mask.shape, torch.inf, dtype=value.dtype, device=value.device)
         q[state, u] = model.expected_cost(pairs, u) + model.discount * total
         return q
+
+    def _worthwhile(self, y: TensorDictBase, keys: Tensor) -> Tensor:
+        """Controls that are expanded, bool ``[N, U]``: the legal ones that are not dominated."""
+        if self.margin is None:
+            return self.model.action_mask(y)
+        q = self.policy.q_factors(y, keys)
+        best = q.amin(-1, keepdim=True)
+        return q <= best + self.margin * best.abs()
 
     def _observations(self, probs: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Pairs, observations and weights of the branches of P pairs with distributions ``probs`` ``[P, Z]``."""
