@@ -1,6 +1,10 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 import torch
@@ -11,6 +15,7 @@ from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
 from torchrl_pomdp.files import write_atomically
 from torchrl_pomdp.modules import GreedyRepair
 from torchrl_pomdp.report import trajectory_figure
+from torchrl_pomdp.trainers.checkpoint import load_checkpoint
 
 TINY = (
     "--iterations 1 --samples-per-part 60 --trajectories 2 --epochs 1 --batch-size 30 --max-steps 60 --states 20 "
@@ -48,6 +53,34 @@ def test_train_evaluate_and_resume(tmp_path, capsys, algorithm):
     tensors = {path: content for path, content in snapshot(out).items() if path.suffix in (".pt", ".json")}
     assert main(command) == 0
     assert {path: content for path, content in snapshot(out).items() if path.suffix in (".pt", ".json")} == tensors
+
+
+def test_a_run_that_is_killed_by_the_system_goes_on(tmp_path, capsys):
+    """SIGKILL as soon as a trained step, or a block of labels, is there; then the same command, once more."""
+    arguments = ["train", "line3", "--algorithm", "pAPI-T", *TINY.split(), "--iterations", "2", "--out"]
+    assert main([*arguments, str(tmp_path / "whole")]) == 0
+    broken = tmp_path / "broken"
+    for sign in ("iteration-1/*.pt", "iteration-2/*.labels/*/*.pt"):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "torchrl_pomdp.cli", *arguments, str(broken)], stderr=subprocess.DEVNULL
+        )
+        deadline = time.monotonic() + 120
+        while process.poll() is None and not list(broken.glob(sign)) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL, "it was killed before it had finished"
+    assert main([*arguments, str(broken)]) == 0
+    capsys.readouterr()
+    for name in ("iteration-1.pt", "iteration-2.pt"):
+        one, other = (load_checkpoint(tmp_path / folder / name) for folder in ("whole", "broken"))
+        for mine, theirs in zip(
+            [*one.policy.parameters(), *one.value.parameters()],
+            [*other.policy.parameters(), *other.value.parameters()],
+            strict=True,
+        ):
+            assert torch.equal(mine, theirs)
+    metrics = [json.loads((tmp_path / folder / "metrics.json").read_text()) for folder in ("whole", "broken")]
+    assert metrics[0] == metrics[1]
 
 
 def test_a_run_folder_of_another_run_is_left_alone(tmp_path, capsys):
