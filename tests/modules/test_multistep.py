@@ -62,7 +62,7 @@ def test_dominated_controls_are_pruned(line3):
     y = random_states(model, 40, seed=3)
     one, margin = at_once(model).q_factors(y), 0.05
     kept = one <= 1.05 * one.amin(-1, keepdim=True)
-    assert 0 < int((~kept & torch.isfinite(one)).sum())
+    assert int((~kept & torch.isfinite(one)).sum()) > 0
     pruned = MultistepLookahead(at_once(model), 2, branches=3, margin=margin).q_factors(y)
     assert torch.equal(torch.isfinite(pruned), kept)
     for row, keep, q in zip(y.split(1), kept, pruned, strict=True):
@@ -134,5 +134,5 @@ def test_bad_arguments_are_refused(line3):
         MultistepLookahead(rollout, 4)
     with pytest.raises(ValueError, match="branches must be at least 1, got 0"):
         MultistepLookahead(rollout, 2, branches=0)
-    with pytest.raises(ValueError, match="margin must not be negative, got -0.1"):
+    with pytest.raises(ValueError, match="margin must not be negative"):
         MultistepLookahead(rollout, 2, margin=-0.1)

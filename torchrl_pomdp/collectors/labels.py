@@ -22,8 +22,9 @@ from torchrl_pomdp.modules.rollout import Policy
 
 __all__ = ["LabelCollector"]
 
-# States drawn, and kept, at once, and labelled between two updates of the progress bar; the data do not depend on either.
-_DRAWN, _LABELLED = 32768, 4096
+# States that are drawn, labelled and kept at once; the data do not depend on it. Many, because a rollout is slow at its end,
+# when few trajectories are left.
+_BLOCK = 16384
 
 
 class LabelCollector(Collector):
@@ -106,7 +107,7 @@ class LabelCollector(Collector):
         self._batches += 1
         index = torch.arange(first, first + size, device=self.env.device)
         with tqdm(total=size, unit="state", desc=self.name, disable=not self.progress, leave=False) as bar:
-            blocks = [self._block(numbers, bar) for numbers in index.split(_DRAWN)]
+            blocks = [self._block(numbers, bar) for numbers in index.split(_BLOCK)]
         batch: Any = torch.cat(blocks, 0)
         batch.set(("collector", "traj_ids"), index)
         return batch.set(("collector", "mask"), torch.ones_like(index, dtype=torch.bool))
@@ -120,14 +121,12 @@ class LabelCollector(Collector):
             self.seconds += content["seconds"]
             bar.update(numbers.numel())
             return TensorDict(content["states"], numbers.shape, device=self.env.device)
-        labelled, before, begin = [], self.labeller.simulated_steps, time.perf_counter()
-        for y in self.env.model.with_features(self.states(numbers)).split(_LABELLED):
-            labelled.append(self.labeller(y))
-            bar.update(y.batch_size.numel())
-        block: Any = torch.cat(labelled, 0)
+        before, begin = self.labeller.simulated_steps, time.perf_counter()
+        block = self.labeller(self.env.model.with_features(self.states(numbers)))
         steps, seconds = self.labeller.simulated_steps - before, time.perf_counter() - begin
         self.simulated_steps += steps
         self.seconds += seconds
+        bar.update(numbers.numel())
         if path is not None:
             save_tensors(path, {"states": block.to_dict(), "simulated_steps": steps, "seconds": seconds})
         return block

@@ -15,8 +15,7 @@ import torch
 __all__ = ["blocks", "map_threads"]
 
 # Trajectories that are made at once, in chunks of the rollout: enough to keep its chunk full nearly all the time.
-_CHUNKS_PER_BLOCK = 4
-
+_CHUNKS_PER_BLOCK = 8
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -33,7 +32,7 @@ def blocks(states: int, trajectories: int, chunk_rows: int, device: torch.device
 
     Examples:
         >>> blocks(10_000, 8, 1024, torch.device("meta"))
-        (512, 1)
+        (1024, 1)
     """
     threads = torch.get_num_threads() if device.type == "cpu" else 1
     return min(max(1, _CHUNKS_PER_BLOCK * chunk_rows // trajectories), -(-states // threads)), threads

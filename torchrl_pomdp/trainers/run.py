@@ -66,8 +66,11 @@ class TrainingRun:
     states: int = 1000
     """Start states of each evaluation."""
 
-    online_states: int = 300
-    """Start states of the evaluations of online rollout, which take longest; 0 for none after training."""
+    online_states: int = 1000
+    """Start states of the evaluation of online rollout on top of the trained policy, which takes longest; 0 for none."""
+
+    online_trajectories: int = 10
+    """Simulated trajectories of each control in online rollout."""
 
     def make_problem(self, device: torch.device | str = "cpu") -> Problem:
         """The problem, partitioned as the algorithm needs it."""
@@ -117,8 +120,9 @@ class _Execution:
         for name, policy in bases.items():
             self._compare(name, policy, run.states)
         base, steady = bases[run.base], SteadyStateCost(model)
-        self._compare(f"R-T of {run.base}", r_t(self.problem, base, steady, trajectories=config.trajectories), run.states)
-        self._compare(f"R-NT of {run.base}", r_nt(self.problem, base, trajectories=config.trajectories), run.states)
+        online = {"trajectories": run.online_trajectories}
+        self._compare(f"R-T of {run.base}", r_t(self.problem, base, steady, **online), run.states)
+        self._compare(f"R-NT of {run.base}", r_nt(self.problem, base, **online), run.states)
         logger = CSVLogger("log", log_dir=str(self.folder))
         training = ALGORITHMS[run.algorithm](
             self.problem, config, bases[run.base], folder=self.folder, logger=logger, progress=self.progress
@@ -136,8 +140,7 @@ class _Execution:
             summaries.append(_summary(iteration))
             write_json(self.folder / "iterations.json", summaries)
         if run.online_states:
-            policy = r_nt(self.problem, training.best, trajectories=config.trajectories)
-            self._compare(f"{best} + R-NT", policy, run.online_states)
+            self._compare(f"{best} + R-NT", r_nt(self.problem, training.best, **online), run.online_states)
         return self.results
 
     @cached_property
