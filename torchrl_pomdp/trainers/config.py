@@ -9,7 +9,7 @@ __all__ = ["PolicyIterationConfig"]
 
 _POSITIVE = (
     "iterations", "samples_per_part", "trajectories", "max_steps", "visits", "memory_capacity", "value_samples",
-    "batch_size", "epochs", "validation_states",
+    "batch_size", "epochs", "least_steps", "validation_states",
 )  # fmt: skip
 
 
@@ -46,13 +46,13 @@ class PolicyIterationConfig:
     max_steps: int = 400
     """Stages after which a simulated trajectory is cut."""
 
-    visited_share: float = 0.9
+    visited_share: float = 0.7
     """Share of the training states taken from the memory of visited states, in [0, 1]; the rest are random."""
 
     visits: int = 20_000
-    """Trajectories of the current policy in each iteration, of whose states the memory retains a tenth."""
+    """Trajectories of the base policy, and of each iteration's, of whose states the memory retains a tenth."""
 
-    exploration: float = 0.05
+    exploration: float = 0.15
     """Probability of a random control at each stage of those trajectories, in [0, 1]."""
 
     memory_capacity: int = 100_000
@@ -84,6 +84,9 @@ class PolicyIterationConfig:
 
     epochs: int = 6
     """Passes over the labelled states."""
+
+    least_steps: int = 1500
+    """Optimisation steps of each network at least, however few the labelled states are."""
 
     validation_states: int = 10_000
     """Start states on which an iteration's policy is compared with the best one so far."""

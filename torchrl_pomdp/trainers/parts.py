@@ -61,7 +61,7 @@ def train_part(
     Args:
         batch: labelled states ``[N]``, from a :class:`~torchrl_pomdp.collectors.LabelCollector`.
         loss: loss module of the network that is trained.
-        config: step size, batch size and epochs.
+        config: step size, batch size, epochs and least number of steps.
 
     Keyword Args:
         seed: seed of the batches.
@@ -73,7 +73,7 @@ def train_part(
         seconds, and the means of the loss module's outputs over the last tenth of the optimisation steps.
     """
     size = batch.batch_size.numel()
-    steps = max(1, config.epochs * size // config.batch_size)
+    steps = max(config.least_steps, config.epochs * size // config.batch_size)
     optimizer = torch.optim.RMSprop(loss.parameters(), config.learning_rate)
     stepper = _Stepper(optimizer, steps, name, logger, progress)
     trainer = Trainer(

@@ -157,7 +157,7 @@ class PolicyIteration:
 
     An iteration starts from the best policy so far. Its policy is accepted if, on fixed validation states and under the same
     noise, its mean cost is lower with 95 % confidence; a rejected one is dropped, and the next iteration tries again with other
-    training states.
+    training states, those where the rejected one went among them.
 
     With a ``folder`` every trained part and every block of labels is kept there as soon as it is there. The same iteration
     with the same folder goes on where an earlier one was interrupted, and gives the same result.
@@ -213,10 +213,12 @@ class PolicyIteration:
     def __iter__(self) -> Iterator[Iteration]:
         """Carry out the iterations, in order."""
         best_costs = self._validate(self.best, "base policy")
+        self._visit(self.best, 0)
         for number in range(1, self.config.iterations + 1):
             local, values, records = self._iterate(number)
             policy = PartitionedPolicy(local).eval()
             costs = self._validate(policy, f"iteration {number}")
+            self._visit(policy, number)
             comparison = compare(costs, best_costs)
             accepted, reason = _judge(comparison)
             self._values = values
@@ -226,12 +228,10 @@ class PolicyIteration:
 
     def _iterate(self, number: int) -> tuple[list[Any], list[Any], dict[str, PartRecord]]:
         """The local policies and values after one iteration from the best policy."""
-        config, best = self.config, self.best
+        best = self.best
         local = list(best.policies) if isinstance(best, PartitionedPolicy) else [best] * self.partition.num_parts
         values: list[Any] = list(self._values)
         records: dict[str, PartRecord] = {}
-        keys = seed_keys(self._seed(number, "visits"), torch.arange(config.visits, device=self.problem.model.device))
-        self.memory.visit(PartitionedPolicy(local), self.problem.start, keys, exploration=config.exploration)
         for index, step in enumerate(self.plan):
             name = f"iteration-{number}/{index + 1}-{type(step).__name__.lower()}"
             networks = {part: self._initial(step, part, local, values, number) for part in step.parts}
@@ -331,6 +331,11 @@ class PolicyIteration:
             return PolicyEvaluation(env, policy, label=partial(PolicyCost, **simulation), **options)
         simulation |= {"trajectories": config.trajectories, "leaves": config.leaves, "allocation": config.allocation}
         return RolloutImprovement(env, policy, label=partial(RolloutPolicy, **simulation), **options)
+
+    def _visit(self, policy: TensorDictModuleBase, number: int) -> None:
+        """Remember states that an iteration's policy visits, also a rejected one's: there the next one can do better."""
+        keys = seed_keys(self._seed(number, "visits"), torch.arange(self.config.visits, device=self.problem.model.device))
+        self.memory.visit(policy, self.problem.start, keys, exploration=self.config.exploration)
 
     def _validate(self, policy: TensorDictModuleBase, name: str) -> torch.Tensor:
         problem, config = self.problem, self.config

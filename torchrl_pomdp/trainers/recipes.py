@@ -60,7 +60,7 @@ def r_t(
         problem: the problem.
         base_policy: the base policy.
         terminal_cost: cost at the cut.
-        truncation: when simulations are cut; by default after 30 steps.
+        truncation: when simulations are cut; by default after 60 steps.
         options: see :class:`~torchrl_pomdp.modules.RolloutPolicy`.
 
     Examples:
@@ -72,7 +72,7 @@ def r_t(
         >>> policy(problem.start(torch.arange(2)))["action"].shape
         torch.Size([2])
     """
-    truncation = AfterSteps(30) if truncation is None else truncation
+    truncation = AfterSteps(60) if truncation is None else truncation
     return RolloutPolicy(problem.model, base_policy, truncation=truncation, terminal_cost=terminal_cost, **options)
 
 

@@ -120,7 +120,7 @@ class _Execution:
         for name, policy in bases.items():
             self._compare(name, policy, run.states)
         base, steady = bases[run.base], SteadyStateCost(model)
-        online = {"trajectories": run.online_trajectories}
+        online: dict[str, Any] = {"trajectories": run.online_trajectories}
         self._compare(f"R-T of {run.base}", r_t(self.problem, base, steady, **online), run.states)
         self._compare(f"R-NT of {run.base}", r_nt(self.problem, base, **online), run.states)
         logger = CSVLogger("log", log_dir=str(self.folder))
