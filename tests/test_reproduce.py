@@ -36,7 +36,15 @@ def test_published_numbers_stand_beside_ours():
 
 def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
     def tiny(settings, problem, scale, seed):
-        small = {"samples_per_part": 40, "value_samples": 40, "trajectories": 2, "epochs": 1, "visits": 20, "max_steps": 60}
+        small = {
+            "samples_per_part": 40,
+            "value_samples": 40,
+            "trajectories": 2,
+            "epochs": 1,
+            "least_steps": 1,
+            "visits": 20,
+            "max_steps": 60,
+        }
         return replace(settings_config(settings, problem, scale, seed), iterations=1, validation_states=20, **small)
 
     original = plan

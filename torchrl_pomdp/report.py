@@ -15,7 +15,17 @@ from torchrl_pomdp.evaluation import Comparison, Estimate
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Result", "cost_figure", "interval_text", "iteration_figure", "table", "time_figure", "trajectory_figure"]
+__all__ = [
+    "Effort",
+    "Result",
+    "cost_figure",
+    "effort",
+    "interval_text",
+    "iteration_figure",
+    "table",
+    "time_figure",
+    "trajectory_figure",
+]
 
 
 @dataclass(frozen=True)
@@ -103,6 +113,52 @@ def iteration_figure(lines: Mapping[str, Sequence[Comparison]]) -> Figure:
     return figure
 
 
+@dataclass(frozen=True)
+class Effort:
+    """What a training run took.
+
+    Attributes:
+        labels: labelled states.
+        steps_per_label: belief steps behind a label of the last step of each iteration, that of the startgame.
+        label_seconds: time of labelling.
+        train_seconds: time of optimisation.
+        parallel_seconds: both together, had every part a processor of its own: the longest part of every step counts.
+    """
+
+    labels: int
+    steps_per_label: float
+    label_seconds: float
+    train_seconds: float
+    parallel_seconds: float
+
+
+def effort(iterations: Sequence[Mapping[str, Any]]) -> Effort:
+    """The effort of a run from its iterations, as ``iterations.json`` has them.
+
+    Examples:
+        >>> record = {"samples": 10, "simulated_steps": 400, "label_seconds": 2.0, "train_seconds": 1.0}
+        >>> parts = {"iteration-1/1-improve-part-0": record, "iteration-1/1-improve-part-1": record}
+        >>> effort([{"parts": parts}])
+        Effort(labels=20, steps_per_label=40.0, label_seconds=4.0, train_seconds=2.0, parallel_seconds=3.0)
+    """
+    steps: dict[str, list[Mapping[str, Any]]] = {}
+    last = []
+    for iteration in iterations:
+        for part, record in iteration["parts"].items():
+            step = part.rsplit("-part-", 1)[0]
+            steps.setdefault(step, []).append(record)
+        last += steps[step]
+    records = [record for found in steps.values() for record in found]
+    return Effort(
+        labels=sum(record["samples"] for record in records),
+        steps_per_label=sum(record["simulated_steps"] for record in last) / sum(record["samples"] for record in last),
+        label_seconds=sum(record["label_seconds"] for record in records),
+        train_seconds=sum(record["train_seconds"] for record in records),
+        # The parts of a step do not wait for each other, steps do.
+        parallel_seconds=sum(max(r["label_seconds"] + r["train_seconds"] for r in found) for found in steps.values()),
+    )
+
+
 def time_figure(runs: dict[str, list[dict[str, Any]]]) -> Figure:
     """Time of labelling and training by part, stacked; beside it what it would be with one processor for each part.
 
@@ -116,16 +172,13 @@ def time_figure(runs: dict[str, list[dict[str, Any]]]) -> Figure:
     axes = figure.add_subplot()
     ticks, labels = [], []
     for number, (name, iterations) in enumerate(runs.items()):
-        steps: dict[str, list[float]] = {}
         bottom = 0.0
         for iteration in iterations:
-            for part, record in iteration["parts"].items():
+            for record in iteration["parts"].values():
                 for kind, colour in (("label_seconds", "#3572a5"), ("train_seconds", "#e8a33d")):
                     axes.bar(number, record[kind], 0.36, bottom=bottom, color=colour, edgecolor="white", linewidth=0.4)
                     bottom += record[kind]
-                steps.setdefault(part.rsplit("-part-", 1)[0], []).append(record["label_seconds"] + record["train_seconds"])
-        # The parts of a step do not wait for each other, steps do.
-        axes.bar(number + 0.4, sum(max(times) for times in steps.values()), 0.36, color="#9aa5b1")
+        axes.bar(number + 0.4, effort(iterations).parallel_seconds, 0.36, color="#9aa5b1")
         ticks.append(number + 0.2)
         labels.append(name)
     for colour, label in (("#3572a5", "labelling"), ("#e8a33d", "training"), ("#9aa5b1", "one processor for each part")):

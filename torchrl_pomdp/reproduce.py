@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from torchrl_pomdp.evaluation import Comparison
 from torchrl_pomdp.files import write_atomically, write_json
-from torchrl_pomdp.report import Result, cost_figure, interval_text, iteration_figure, time_figure
+from torchrl_pomdp.report import Result, cost_figure, effort, interval_text, iteration_figure, time_figure
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.run import TrainingRun, provenance
 
@@ -194,6 +194,7 @@ def reproduce(
     }
     write_json(out / f"{title}.json", content)
     text = comparison_table({name: (run.problem, results[name]) for name, run in planned.items()})
+    text += f"\n\n{effort_table({f'{run.problem}, {run.algorithm}': iterations[name] for name, run in planned.items()})}"
     write_atomically(out / f"{title}.md", lambda path: path.write_text(text + "\n"))
     _draw(out, title, planned, results, iterations)
     return text
@@ -223,6 +224,30 @@ def comparison_table(results: dict[str, tuple[str, dict[str, Comparison]]]) -> s
                 f"| {problem} | {policy} | {comparison.cost.count} | {interval_text(comparison.cost)} | "
                 f"{comparison.ratio.mean:.3f} | {low:.3f} … {high:.3f} | {beside} |"
             )
+    return "\n".join(lines)
+
+
+def effort_table(runs: dict[str, list[dict[str, Any]]]) -> str:
+    """Markdown table of what training took, for the iterations of runs by name.
+
+    Examples:
+        >>> record = {"samples": 10, "simulated_steps": 400, "label_seconds": 2.0, "train_seconds": 1.0}
+        >>> print(effort_table({"line3": [{"parts": {"iteration-1/1-improve-part-0": record}}]}))
+        | run | labels | belief steps per startgame label | labelling | training | a processor for each part | speed-up |
+        |---|---|---|---|---|---|---|
+        | line3 | 10 | 40 | 2 s | 1 s | 3 s | 1.0 |
+    """
+    lines = [
+        "| run | labels | belief steps per startgame label | labelling | training | a processor for each part | speed-up |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, iterations in runs.items():
+        e = effort(iterations)
+        speed_up = (e.label_seconds + e.train_seconds) / e.parallel_seconds
+        lines.append(
+            f"| {name} | {e.labels} | {e.steps_per_label:.0f} | {e.label_seconds:.0f} s | {e.train_seconds:.0f} s | "
+            f"{e.parallel_seconds:.0f} s | {speed_up:.1f} |"
+        )
     return "\n".join(lines)
 
 

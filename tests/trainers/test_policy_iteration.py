@@ -41,6 +41,7 @@ TINY = PolicyIterationConfig(
     value_samples=150,
     trajectories=2,
     epochs=2,
+    least_steps=1,
     batch_size=50,
     hidden=(16,),
     value_hidden=(16,),
@@ -194,6 +195,15 @@ def test_a_worse_iteration_is_rejected_and_the_best_policy_stays(line3):
     assert not torch.equal(weights(iterations[0].policy), weights(iterations[1].policy)), "it tries other states"
 
 
+def test_states_of_every_iterations_policy_are_remembered(line3, monkeypatch):
+    seen = []
+    monkeypatch.setattr(module.StateMemory, "visit", lambda self, policy, *args, **options: seen.append(policy))
+    base = UrgencyRepair(line3.model)
+    iterations = list(papi_nt(line3, replace(TINY, iterations=2, samples_per_part=20, epochs=1), base))
+    assert not any(iteration.accepted for iteration in iterations)
+    assert seen == [base, *(iteration.policy for iteration in iterations)]
+
+
 class Killed(BaseException):
     """Stands for SIGKILL: nothing catches it."""
 
@@ -289,7 +299,8 @@ def test_models_without_a_partition_are_refused():
     [
         {"iterations": 0}, {"samples_per_part": 0}, {"trajectories": 0}, {"max_steps": 0}, {"batch_size": 0},
         {"visits": 0}, {"memory_capacity": 0}, {"value_samples": 0}, {"validation_states": 0}, {"value_hidden": (0,)},
-        {"epochs": 0}, {"visited_share": 1.5}, {"exploration": -0.1}, {"learning_rate": 0.0}, {"hidden": ()},
+        {"epochs": 0}, {"least_steps": 0}, {"visited_share": 1.5},
+        {"exploration": -0.1}, {"learning_rate": 0.0}, {"hidden": ()},
     ],
 )  # fmt: skip
 def test_bad_numbers_are_named(change):

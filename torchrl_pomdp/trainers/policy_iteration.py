@@ -181,7 +181,7 @@ class PolicyIteration:
         >>> from torchrl_pomdp.modules import GreedyRepair
         >>> from torchrl_pomdp.trainers import papi_nt
         >>> problem = make_problem("line3")
-        >>> config = PolicyIterationConfig(iterations=1, samples_per_part=40, trajectories=2, epochs=1, validation_states=50)
+        >>> config = PolicyIterationConfig(iterations=1, samples_per_part=40, least_steps=1, validation_states=50)
         >>> run = papi_nt(problem, config, GreedyRepair(problem.model))
         >>> [iteration.accepted for iteration in run], run.best is run.base_policy
         ([False], True)
