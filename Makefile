@@ -6,7 +6,7 @@ BIN := .venv/bin
 DEMO ?= runs/demo-$(shell date +%Y%m%d-%H%M%S)
 
 demo: .venv/installed
-	$(BIN)/torchrl-pomdp train linear20 --samples-per-part 9000 --trajectories 6 --iterations 2 --out $(DEMO)
+	$(BIN)/torchrl-pomdp train linear20 --samples-per-part 6000 --iterations 2 --out $(DEMO)
 
 test: .venv/installed lint
 	$(BIN)/pytest
