@@ -1,19 +1,18 @@
-"""Timing, the machine, and the table that a benchmark fills."""
+"""Timing, and the table that a benchmark fills."""
 
 from __future__ import annotations
 
 import json
-import os
-import platform
 import statistics
 import time
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
+
+from torchrl_pomdp.provenance import provenance
 
 
 @dataclass
@@ -25,23 +24,6 @@ class Table:
     def add(self, name: str, value: float, unit: str = "ratio", target: str = "") -> None:
         self.rows.append({"name": name, "value": value, "unit": unit, "target": target})
         print(f"{name:78s} {value:12.4g} {unit:12s} {target}", flush=True)
-
-
-def machine() -> dict:
-    """What the figures were taken on."""
-    model = next((line.split(":")[1].strip() for line in _cpuinfo() if line.startswith("model name")), platform.processor())
-    packages = ("torch", "torchrl", "tensordict", "numba")
-    return {
-        "cpu": model,
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "versions": {name: version(name) for name in packages},
-    }
-
-
-def _cpuinfo() -> list[str]:
-    path = Path("/proc/cpuinfo")
-    return path.read_text().splitlines() if path.exists() else []
 
 
 def seconds(function: Callable[[], object], repeats: int = 3) -> float:
@@ -70,7 +52,7 @@ def write(path: Path, results: dict[str, Table]) -> None:
     """Merge results into the JSON file ``path``, replaced as a whole."""
     content = json.loads(path.read_text()) if path.exists() else {}
     for name, table in results.items():
-        content[name] = {"machine": machine(), "rows": asdict(table)["rows"]}
+        content[name] = {"machine": provenance("numba"), "rows": asdict(table)["rows"]}
     temporary = path.with_suffix(".tmp")
     temporary.write_text(json.dumps(content, indent=1) + "\n")
     temporary.replace(path)

@@ -32,6 +32,18 @@ def test_readme_blocks_run(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out
 
 
+def test_the_results_in_the_readme_are_those_of_the_results_folder():
+    text = (ROOT / "README.md").read_text()
+    section = text[text.index("## Results") : text.index("## Reproducibility")]
+    rows = [line for line in section.splitlines() if line.startswith("| ")]
+    measured = {line for path in (ROOT / "results").glob("*.md") for line in path.read_text().splitlines()}
+    assert len(rows) > 10
+    assert [row for row in rows if row not in measured] == []
+    pictures = re.findall(r"\]\(([^)]+\.png)\)", section)
+    assert pictures
+    assert all((ROOT / picture).is_file() for picture in pictures)
+
+
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_notebooks_are_their_scripts(script):
     notebook = nbformat.read(script.with_suffix(".ipynb"), as_version=4)

@@ -17,12 +17,13 @@ from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import write_atomically, write_json
 from torchrl_pomdp.modules import GreedyRepair, Policy
 from torchrl_pomdp.noise import seed_keys
+from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import Result, cost_figure, table, trajectory_figure
 from torchrl_pomdp.reproduce import EXPERIMENTS, reproduce
 from torchrl_pomdp.trainers import r_nt
 from torchrl_pomdp.trainers.checkpoint import load_checkpoint
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
-from torchrl_pomdp.trainers.run import BASE_POLICIES, EVALUATION_SEED, TrainingRun, provenance
+from torchrl_pomdp.trainers.run import BASE_POLICIES, EVALUATION_SEED, TrainingRun
 
 
 @dataclass(frozen=True)

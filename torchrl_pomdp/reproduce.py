@@ -14,9 +14,10 @@ from tqdm import tqdm
 
 from torchrl_pomdp.evaluation import Comparison
 from torchrl_pomdp.files import write_atomically, write_json
+from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import Result, cost_figure, effort, interval_text, iteration_figure, time_figure
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
-from torchrl_pomdp.trainers.run import TrainingRun, provenance
+from torchrl_pomdp.trainers.run import TrainingRun
 
 __all__ = ["EXPERIMENTS", "PUBLISHED", "Experiment", "plan", "reproduce", "settings_config"]
 
@@ -181,12 +182,21 @@ def reproduce(
     title = f"{experiment.name}-{settings}-{base}-scale{scale:g}-seed{seed}"
     if problems:
         title = f"{title}-{'-'.join(problems)}"
+    about = {"experiment": experiment.name, "settings": settings, "base": base, "scale": scale, "seed": seed}
+    return _write(out, title, about, planned, results, iterations)
+
+
+def _write(
+    out: Path,
+    title: str,
+    about: dict[str, Any],
+    planned: dict[str, TrainingRun],
+    results: dict[str, dict[str, Comparison]],
+    iterations: dict[str, list[dict[str, Any]]],
+) -> str:
+    """Write numbers, tables and figures; returns the tables."""
     content = {
-        "experiment": experiment.name,
-        "settings": settings,
-        "base": base,
-        "scale": scale,
-        "seed": seed,
+        **about,
         "provenance": provenance(),
         "runs": {name: asdict(run) for name, run in planned.items()},
         "results": {name: {p: asdict(c) for p, c in found.items()} for name, found in results.items()},

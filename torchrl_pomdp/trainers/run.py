@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +22,7 @@ from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.policy_iteration import Iteration
 from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt, r_t
 
-__all__ = ["ALGORITHMS", "BASE_POLICIES", "EVALUATION_SEED", "TrainingRun", "provenance"]
+__all__ = ["ALGORITHMS", "BASE_POLICIES", "EVALUATION_SEED", "TrainingRun"]
 
 ALGORITHMS = {"pAPI-NT": papi_nt, "pAPI-T": papi_t, "API": api}
 """The algorithms that learn, by name."""
@@ -170,17 +168,6 @@ class _Execution:
         ).cpu()
         save_tensors(path, costs)
         return costs
-
-
-def provenance() -> dict[str, Any]:
-    """Versions, hardware and threads, to put beside results."""
-    packages = ("torchrl-pomdp", "torch", "torchrl", "tensordict")
-    return {
-        "python": platform.python_version(),
-        "versions": {name: version(name) for name in packages},
-        "machine": platform.machine(),
-        "threads": torch.get_num_threads(),
-    }
 
 
 def _summary(iteration: Iteration) -> dict[str, Any]:
