@@ -21,7 +21,7 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_pomdp.envs.presets import Problem
-from torchrl_pomdp.modules import AfterSteps, OnEntering, RolloutPolicy, TerminalCost, Truncation
+from torchrl_pomdp.modules import OnEntering, RolloutPolicy, TerminalCost, Truncation
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.policy_iteration import Evaluate, Improve, PolicyIteration
 
@@ -51,7 +51,7 @@ def r_t(
     problem: Problem,
     base_policy: TensorDictModuleBase,
     terminal_cost: TerminalCost,
-    truncation: Truncation | None = None,
+    truncation: Truncation,
     **options: Any,
 ) -> RolloutPolicy:
     """Rollout with truncation: online, nothing is learnt.
@@ -60,19 +60,18 @@ def r_t(
         problem: the problem.
         base_policy: the base policy.
         terminal_cost: cost at the cut.
-        truncation: when simulations are cut; by default after 60 steps.
+        truncation: when simulations are cut.
         options: see :class:`~torchrl_pomdp.modules.RolloutPolicy`.
 
     Examples:
         >>> import torch
         >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair, SteadyStateCost
+        >>> from torchrl_pomdp.modules import AfterSteps, GreedyRepair, SteadyStateCost
         >>> problem = make_problem("line3")
-        >>> policy = r_t(problem, GreedyRepair(problem.model), SteadyStateCost(problem.model))
+        >>> policy = r_t(problem, GreedyRepair(problem.model), SteadyStateCost(problem.model), AfterSteps(60))
         >>> policy(problem.start(torch.arange(2)))["action"].shape
         torch.Size([2])
     """
-    truncation = AfterSteps(60) if truncation is None else truncation
     return RolloutPolicy(problem.model, base_policy, truncation=truncation, terminal_cost=terminal_cost, **options)
 
 

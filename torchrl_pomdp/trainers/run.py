@@ -16,7 +16,7 @@ from torchrl.record import CSVLogger
 from torchrl_pomdp.envs import Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import load_tensors, save_tensors, write_json
-from torchrl_pomdp.modules import GreedyRepair, Policy, SteadyStateCost, UrgencyRepair
+from torchrl_pomdp.modules import GreedyRepair, Policy, UrgencyRepair
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, save_checkpoint
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.policy_iteration import Iteration
@@ -46,7 +46,7 @@ class TrainingRun:
         >>> run = TrainingRun("line3", config=config, states=20, online_states=0)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     list(run.carry_out(Path(folder) / "run"))
-        ['greedy', 'urgency', 'R-T of greedy', 'R-NT of greedy', 'pAPI-NT 1']
+        ['greedy', 'urgency', 'R-NT of greedy', 'pAPI-NT 1']
     """
 
     problem: str
@@ -117,13 +117,12 @@ class _Execution:
         bases = {name: make(model) for name, make in BASE_POLICIES.items()}
         for name, policy in bases.items():
             self._compare(name, policy, run.states)
-        base, steady = bases[run.base], SteadyStateCost(model)
+        base = bases[run.base]
         online: dict[str, Any] = {"trajectories": run.online_trajectories}
-        self._compare(f"R-T of {run.base}", r_t(self.problem, base, steady, **online), run.states)
         self._compare(f"R-NT of {run.base}", r_nt(self.problem, base, **online), run.states)
         logger = CSVLogger("log", log_dir=str(self.folder))
         training = ALGORITHMS[run.algorithm](
-            self.problem, config, bases[run.base], folder=self.folder, logger=logger, progress=self.progress
+            self.problem, config, base, folder=self.folder, logger=logger, progress=self.progress
         )
         best: str = run.base
         summaries = []
@@ -134,6 +133,10 @@ class _Execution:
             if iteration.accepted:
                 save_checkpoint(self.folder / "best.pt", checkpoint)
                 best = name
+            if iteration.number == 1 and (truncation := training.plan[-1].truncation) is not None:
+                # What the networks of the startgame have learnt from, played online.
+                truncated = r_t(self.problem, base, iteration.value, truncation, **online)
+                self._compare(f"R-T of {run.base}", truncated, run.states)
             self._compare(name, iteration.policy, run.states)
             summaries.append(_summary(iteration))
             write_json(self.folder / "iterations.json", summaries)
