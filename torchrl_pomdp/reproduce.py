@@ -261,6 +261,11 @@ def effort_table(runs: dict[str, list[dict[str, Any]]]) -> str:
     return "\n".join(lines)
 
 
+def _is_iteration(policy: str, run: TrainingRun) -> bool:
+    """Whether a policy of that name is what an iteration of the run has trained."""
+    return policy.removeprefix(f"{run.algorithm} ").isdigit()
+
+
 def _iteration_labels(run: TrainingRun) -> int:
     parts = 1 if run.algorithm == "API" else 6
     values = 3 * run.config.value_samples if run.algorithm == "pAPI-T" else 0
@@ -276,7 +281,7 @@ def _follow(
     comparison: Comparison,
 ) -> None:
     """Report a comparison, and count the labels of the iteration that it ends."""
-    if policy.removeprefix(f"{run.algorithm} ").isdigit():
+    if _is_iteration(policy, run):
         bar.update(_iteration_labels(run))
     report(name, policy, comparison)
 
@@ -297,7 +302,7 @@ def _draw(
     for name, run in planned.items():
         found = results[name]
         lines[f"{run.problem}, {run.algorithm}"] = [found[run.base]] + [
-            found[policy] for policy in found if policy.removeprefix(f"{run.algorithm} ").isdigit()
+            found[policy] for policy in found if _is_iteration(policy, run)
         ]
     write_atomically(out / f"{title}-iterations.png", iteration_figure(lines).savefig)
     times = {f"{run.problem}, {run.algorithm}": iterations[name] for name, run in planned.items()}

@@ -35,7 +35,7 @@ class PolicyIterationConfig:
     """Labelled states for each part of the partition and iteration."""
 
     trajectories: int = 2
-    """Simulated trajectories from each leaf of the lookahead tree; the paper's 10 teach less than five times the states."""
+    """Simulated trajectories from each leaf of the lookahead tree; the paper has 10."""
 
     leaves: Literal["control", "observation"] = "control"
     """What a leaf is: a control, its first observations stratified, or a pair of control and first observation."""

@@ -212,13 +212,13 @@ class PolicyIteration:
 
     def __iter__(self) -> Iterator[Iteration]:
         """Carry out the iterations, in order."""
-        best_costs = self._validate(self.best, "base policy")
-        self._visit(self.best, 0)
+        policy = self.best
+        best_costs = self._validate(policy, "base policy")
         for number in range(1, self.config.iterations + 1):
+            self._visit(policy, number - 1)
             local, values, records = self._iterate(number)
             policy = PartitionedPolicy(local).eval()
             costs = self._validate(policy, f"iteration {number}")
-            self._visit(policy, number)
             comparison = compare(costs, best_costs)
             accepted, reason = _judge(comparison)
             self._values = values
