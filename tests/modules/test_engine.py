@@ -7,6 +7,8 @@ import warnings
 
 import pytest
 import torch
+from torch._dynamo import config as dynamo_config
+from torch._dynamo.utils import counters
 from torch._inductor import config as inductor_config
 
 from torchrl_pomdp.envs import CalibratedStart, RepairModel, damage_chain, line, tiger
@@ -18,6 +20,7 @@ from torchrl_pomdp.modules import (
     RolloutPolicy,
     TruncatedRollout,
 )
+from torchrl_pomdp.modules.compiling import compiled
 from torchrl_pomdp.modules.lookahead import spread
 from torchrl_pomdp.modules.threads import map_threads
 
@@ -86,6 +89,23 @@ def test_without_a_compiler_it_runs_as_it_is(line3):
     ):
         cost = TruncatedRollout(line3.model, greedy, compile=True)(y, keys)
     assert torch.equal(cost, TruncatedRollout(line3.model, greedy)(y, keys))
+
+
+def test_each_compiled_function_has_its_own_limit_of_compilations():
+    """Rollouts of several problems have the same step; none may use up what another one is allowed."""
+
+    class Multiple:
+        def __init__(self, twice):
+            self.twice = twice
+
+        def of(self, x):
+            return x * 2 if self.twice else x * 3
+
+    x, before = torch.arange(4.0), counters["stats"]["unique_graphs"]
+    with dynamo_config.patch(recompile_limit=1):
+        for twice in (True, False):
+            assert torch.equal(compiled(Multiple(twice).of)(x), x * (2 if twice else 3))
+    assert counters["stats"]["unique_graphs"] == before + 2
 
 
 def test_float32_agrees_with_float64_over_long_runs_on_long_lines():

@@ -311,7 +311,8 @@ class RepairModel(BeliefModel):
             return self._set_levels(self._degrade_planes(planes), location, levels)
         # Written level by level, with choices for scatters, the compiler makes one pass of it.
         places = torch.arange(self.num_locations, dtype=self.dtype, device=planes.device).unsqueeze(-1)
-        here = [places == place.to(self.dtype) for place in location]
+        location, levels = _kept(location.to(self.dtype)), _kept(levels.to(self.dtype))
+        here = [places == place for place in location]
         result = []
         for k in range(self.num_levels):
             plane = self._next_level(planes, k)
@@ -350,6 +351,11 @@ class RepairModel(BeliefModel):
         shape = y.batch_size
         belief = planes.permute(2, 0, 1).reshape(*shape, self.num_locations, self.num_levels)
         return self.successor(y, belief=belief, location=location.T.reshape(*shape, self.num_robots))
+
+
+def _kept(rows: Tensor) -> Tensor:
+    """``rows``, computed once: the compiler would compute them again for every location."""
+    return rows.as_strided(rows.shape, rows.stride())
 
 
 def _digits(number: Tensor, base: int, count: int) -> Tensor:

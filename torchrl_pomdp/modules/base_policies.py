@@ -65,7 +65,8 @@ class GreedyRepair(TensorDictModuleBase):
     def _robot_control(self, intact: Tensor, location: Tensor) -> Tensor:
         """Control ``[N]`` of a robot at ``location`` ``[N]``, given the intact flags ``[L, N]``."""
         size = self.model.num_locations
-        rank = self.ranks.index_select(1, location).add_(intact, alpha=float(size * size)).amin(0)
+        # Compiled, `gather` costs a fourth of `index_select`, which also admits indices from the end.
+        rank = self.ranks.gather(1, location.expand(size, -1)).add_(intact, alpha=float(size * size)).amin(0)
         nowhere = rank >= size * size
         # The remainder by `size`, exact in floating point and much faster than an integer division.
         target = (rank - (rank / size).floor() * size).to(torch.int64)
@@ -122,7 +123,7 @@ class UrgencyRepair(TensorDictModuleBase):
         controls = []
         for robot in range(model.num_robots):
             place = location[:, robot]
-            urgency = costs * self.nearness.index_select(1, place)
+            urgency = costs * self.nearness.gather(1, place.expand(model.num_locations, -1))
             highest = urgency.amax(0)
             # The first location that attains the highest: all others rank behind it. Much faster than argmax.
             rank = (highest - urgency).sign_().mul_(model.num_locations).add_(self.indices).amin(0)

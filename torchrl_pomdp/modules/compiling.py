@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from types import FunctionType, MethodType
 from typing import Any
 
 import torch
 
 __all__ = ["compiled"]
+
+# Reductions over the locations, unlike the compiler's own loops for them, are fast when written out.
+_OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {"unroll_reductions_threshold": 64}
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -23,7 +27,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         >>> compiled(torch.neg)
         <function compiled.<locals>.call at ...>
     """
-    fast: Callable[..., Any] | None = torch.compile(function, dynamic=True)
+    fast: Callable[..., Any] | None = torch.compile(_own_code(function), dynamic=True, options=_OPTIONS)
 
     def call(*args: Any) -> Any:
         nonlocal fast
@@ -40,3 +44,20 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return function(*args)
 
     return call
+
+
+def _own_code(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``function`` with a code object of its own.
+
+    The compiler counts by code object how often it has compiled, and gives up at a limit; the same function of many objects,
+    such as the step of many rollouts, would reach it.
+    """
+    if isinstance(function, MethodType):
+        return MethodType(_own_code(function.__func__), function.__self__)
+    if not isinstance(function, FunctionType):
+        return function
+    copy = FunctionType(
+        function.__code__.replace(), function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
+    copy.__kwdefaults__ = function.__kwdefaults__
+    return copy

@@ -85,7 +85,7 @@ class RolloutPolicy(TensorDictModuleBase):
         truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
         seed: int = 0,
-        chunk_rows: int = 16384,
+        chunk_rows: int = 16_000,
         compile: bool = False,
     ) -> None:
         super().__init__()

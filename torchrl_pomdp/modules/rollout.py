@@ -88,9 +88,10 @@ class TruncatedRollout(nn.Module):
         truncation: rule that cuts trajectories earlier, see :mod:`~torchrl_pomdp.modules.truncation`; None: never.
         terminal_cost: :math:`\hat J`, added at the cut; None is zero, right where only ``max_steps`` cuts and is large
             enough for discounting or the terminal states to make the rest insignificant.
-        chunk_rows: largest number of trajectories simulated at once; bounds the memory, never changes the result.
+        chunk_rows: largest number of trajectories simulated at once; bounds the memory, never changes the result. Powers of
+            two are slower: planes that lie so far apart compete for the same lines of the cache.
         compile: whether to fuse policy and belief step by ``torch.compile``, see :func:`~.compiling.compiled`; worth its
-            time for long runs with simple base policies.
+            time for long runs, or many single decisions, with simple base policies.
 
     Attributes:
         simulated_steps: belief steps made so far.
@@ -131,7 +132,7 @@ class TruncatedRollout(nn.Module):
         max_steps: int = 400,
         truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
-        chunk_rows: int = 16384,
+        chunk_rows: int = 16_000,
         compile: bool = False,
     ) -> None:
         super().__init__()

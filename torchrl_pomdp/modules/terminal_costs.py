@@ -146,7 +146,7 @@ class PolicyCost(TensorDictModuleBase):
         terminal_cost: TerminalCost | None = None,
         max_steps: int = 400,
         seed: int = 0,
-        chunk_rows: int = 16384,
+        chunk_rows: int = 16_000,
     ) -> None:
         super().__init__()
         if trajectories < 1:
