@@ -140,19 +140,22 @@ def locations(table: Table) -> None:
 
 
 _MEMORY = """
-import resource, sys, torch
+import sys, torch
+from pathlib import Path
 from benchmarks.setting import line_problem
 from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout
 torch.set_num_threads(1)
+# The peak of this program alone; what `resource` tells includes that of the one which has started it.
+peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
 rows, steps = int(sys.argv[1]), int(sys.argv[2])
 model, start = line_problem(20, drift=0.01)
 keys = torch.arange(rows)
 # Few different states, so that making them takes no memory to speak of.
 y = start(torch.arange(1024))[keys % 1024]
 TruncatedRollout(model, GreedyRepair(model), max_steps=2, chunk_rows=64)(y[:64], keys[:64])
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+before = peak()
 TruncatedRollout(model, GreedyRepair(model), max_steps=steps, chunk_rows=rows)(y, keys)
-print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
+print((peak() - before) * 1024)
 """
 
 
