@@ -168,7 +168,7 @@ def time_figure(runs: dict[str, list[dict[str, Any]]]) -> Figure:
     Raises:
         ImportError: if matplotlib, the extra ``plot``, is not installed.
     """
-    figure = _new_figure(2.2 * len(runs) + 2.5, 4.0)
+    figure = _new_figure(2.2 * len(runs) + 3.0, 4.0)
     axes = figure.add_subplot()
     ticks, labels = [], []
     for number, (name, iterations) in enumerate(runs.items()):
@@ -186,7 +186,7 @@ def time_figure(runs: dict[str, list[dict[str, Any]]]) -> Figure:
     axes.set_xticks(ticks, labels, fontsize="small")
     axes.set_ylabel("seconds")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize="small")
+    figure.legend(loc="outside upper center", ncols=3, fontsize="small")
     return figure
 
 
