@@ -311,7 +311,8 @@ class RepairModel(BeliefModel):
             return self._set_levels(self._degrade_planes(planes), location, levels)
         # Written level by level, with choices for scatters, the compiler makes one pass of it.
         places = torch.arange(self.num_locations, dtype=self.dtype, device=planes.device).unsqueeze(-1)
-        location, levels = _kept(location.to(self.dtype)), _kept(levels.to(self.dtype))
+        # A view by strides is of something that is in memory; else the rows' numbers were computed again for every plane.
+        location, levels = (rows.to(self.dtype).as_strided(rows.shape, rows.stride()) for rows in (location, levels))
         here = [places == place for place in location]
         result = []
         for k in range(self.num_levels):
@@ -351,11 +352,6 @@ class RepairModel(BeliefModel):
         shape = y.batch_size
         belief = planes.permute(2, 0, 1).reshape(*shape, self.num_locations, self.num_levels)
         return self.successor(y, belief=belief, location=location.T.reshape(*shape, self.num_robots))
-
-
-def _kept(rows: Tensor) -> Tensor:
-    """``rows``, computed once: the compiler would compute them again for every location."""
-    return rows.as_strided(rows.shape, rows.stride())
 
 
 def _digits(number: Tensor, base: int, count: int) -> Tensor:

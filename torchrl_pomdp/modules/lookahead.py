@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_pomdp.envs.belief import BeliefModel, take_rows
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.rollout import CHUNK_ROWS, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
@@ -85,7 +85,7 @@ class RolloutPolicy(TensorDictModuleBase):
         truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
         seed: int = 0,
-        chunk_rows: int = 16_000,
+        chunk_rows: int = CHUNK_ROWS,
         compile: bool = False,
     ) -> None:
         super().__init__()

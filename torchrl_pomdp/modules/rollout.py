@@ -24,6 +24,8 @@ TerminalCost = Callable[[TensorDictBase], Tensor | TensorDictBase]
 r"""Terminal cost approximation :math:`\hat J`: feature states ``[*B]`` to costs ``[*B]``, or a TensorDictModule that writes
 them as ``"state_value"`` ``[*B]`` (costs, lower is better). ``in_keys``, where it has them, name the features that it reads."""
 
+# Default of `chunk_rows`, wherever a rollout is made. No power of two: planes that lie so far apart compete for cache lines.
+CHUNK_ROWS = 16_000
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
 _RENEW_FRACTION = 0.15
 
@@ -132,7 +134,7 @@ class TruncatedRollout(nn.Module):
         max_steps: int = 400,
         truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
-        chunk_rows: int = 16_000,
+        chunk_rows: int = CHUNK_ROWS,
         compile: bool = False,
     ) -> None:
         super().__init__()

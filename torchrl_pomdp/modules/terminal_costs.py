@@ -13,7 +13,7 @@ from torchrl_pomdp.envs.belief import BeliefModel, take_rows
 from torchrl_pomdp.envs.partition import location_costs
 from torchrl_pomdp.envs.repair import RepairModel
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.rollout import CHUNK_ROWS, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
@@ -146,7 +146,7 @@ class PolicyCost(TensorDictModuleBase):
         terminal_cost: TerminalCost | None = None,
         max_steps: int = 400,
         seed: int = 0,
-        chunk_rows: int = 16_000,
+        chunk_rows: int = CHUNK_ROWS,
     ) -> None:
         super().__init__()
         if trajectories < 1:
