@@ -26,15 +26,20 @@ class Table:
         print(f"{name:78s} {value:12.4g} {unit:12s} {target}", flush=True)
 
 
-def seconds(function: Callable[[], object], repeats: int = 3) -> float:
-    """Median time of a call, after one call that is not counted."""
-    function()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
+def seconds(*functions: Callable[[], object], repeats: int = 3) -> list[float]:
+    """Median time of a call of each function, after one call of each that is not counted.
+
+    They are called in turn, so that what else the machine does meets them all alike.
+    """
+    times: list[list[float]] = [[] for _ in functions]
+    for function in functions:
         function()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+    for _ in range(repeats):
+        for function, mine in zip(functions, times, strict=True):
+            start = time.perf_counter()
+            function()
+            mine.append(time.perf_counter() - start)
+    return [statistics.median(mine) for mine in times]
 
 
 @contextmanager

@@ -344,25 +344,28 @@ class BeliefEnv(EnvBase):
         return self._with_done(y)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        y, u = tensordict.select(*self.observation_spec.keys()), tensordict.get("action")
-        self._check_legal(y, u)
-        noise = torch.rand((*y.batch_size, self.model.noise_dim), generator=self.rng, device=self.device)
-        cost, nxt = self.model.advance(y, u, noise)
-        cost = cost.masked_fill(self.model.is_terminal(y), 0.0)
-        return self._with_done(nxt).set("reward", -cost.unsqueeze(-1))
+        u = tensordict.get("action")
+        self._check_legal(tensordict, u)
+        noise = torch.rand((*tensordict.batch_size, self.model.noise_dim), generator=self.rng, device=self.device)
+        cost, nxt = self.model.advance(tensordict, u, noise)
+        terminal = tensordict.get("terminated", None)
+        terminal = self.model.is_terminal(tensordict) if terminal is None else terminal.squeeze(-1)
+        return self._with_done(nxt).set("reward", -cost.masked_fill(terminal, 0.0).unsqueeze(-1))
 
     def _check_legal(self, y: TensorDictBase, u: Tensor) -> None:
         if u.shape != y.batch_size or u.dtype != torch.int64:
             raise ValueError(f"action must be int64 of shape {tuple(y.batch_size)}, got {u.dtype} of shape {tuple(u.shape)}")
+        mask = y.get("action_mask")
+        low, high = u.aminmax() if u.numel() else (0, 0)
+        if low >= 0 and high < self.model.num_controls and mask.gather(-1, u.unsqueeze(-1)).all():
+            return
         known = (u >= 0) & (u < self.model.num_controls)
         index = u.clamp(0, self.model.num_controls - 1).unsqueeze(-1)
-        legal = known & y.get("action_mask").gather(-1, index).squeeze(-1)
-        if not legal.all():
-            where = (~legal).nonzero()[0].tolist()
-            raise ValueError(
-                f"action {int(u[tuple(where)])} at batch index {tuple(where)} is illegal; "
-                f"legal there: {y.get('action_mask')[tuple(where)].nonzero().flatten().tolist()}"
-            )
+        where = (~(known & mask.gather(-1, index).squeeze(-1))).nonzero()[0].tolist()
+        raise ValueError(
+            f"action {int(u[tuple(where)])} at batch index {tuple(where)} is illegal; "
+            f"legal there: {mask[tuple(where)].nonzero().flatten().tolist()}"
+        )
 
     def _with_done(self, y: TensorDictBase) -> TensorDictBase:
         terminated = self.model.is_terminal(y).unsqueeze(-1)

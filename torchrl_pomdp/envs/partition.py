@@ -129,7 +129,10 @@ class RepairPartition(Partition):
 
 def location_costs(planes: Tensor, costs: Sequence[float]) -> Tensor:
     """Expected cost of every location, ``[L, *B]``, for beliefs as planes ``[L, K, *B]`` and a cost for each level."""
-    total = planes[:, 0] * costs[0]
-    for level in range(1, len(costs)):
+    paid = [level for level, cost in enumerate(costs) if cost != 0]
+    if not paid:
+        return torch.zeros_like(planes[:, 0])
+    total = planes[:, paid[0]] * costs[paid[0]]
+    for level in paid[1:]:
         total.add_(planes[:, level], alpha=costs[level])
     return total

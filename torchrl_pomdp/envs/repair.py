@@ -88,6 +88,7 @@ class RepairModel(BeliefModel):
     chain: Tensor
     costs: Tensor
     destinations: Tensor
+    _legal_when_intact: Tensor
     first_controls: Tensor
     _levels: Tensor
 
@@ -125,11 +126,14 @@ class RepairModel(BeliefModel):
     def _register_tables(self, chain: Tensor, costs: Tensor, device: torch.device) -> None:
         nodes = torch.arange(self.num_locations).unsqueeze(-1)
         destinations = torch.cat([nodes, self.graph.neighbours], -1)
+        moves = self.graph.neighbours >= 0
         tables = {
             "chain": chain,
             "costs": costs,
             # [L, A]: location after a robot's control, -1 where the move leaves the graph.
             "destinations": destinations,
+            # [L, A]: legal controls of a robot whose location is known to be intact.
+            "_legal_when_intact": torch.cat([~moves.any(-1, keepdim=True), moves], -1),
             "first_controls": self.graph.first_controls,
             "_levels": torch.arange(self.num_levels).unsqueeze(-1),
         }
@@ -192,10 +196,8 @@ class RepairModel(BeliefModel):
     def action_mask(self, y: TensorDictBase) -> Tensor:
         """Legal joint controls, bool ``[*B, U]``: every robot's control is legal for it."""
         belief, location = y.get("belief"), y.get("location")
-        moves = self.destinations[location][..., 1:] >= 0
-        intact = belief[..., 0].gather(-1, location) >= 1.0
-        repair = ~(intact & moves.any(-1))
-        robots = torch.cat([repair.unsqueeze(-1), moves], -1)
+        robots = self._legal_when_intact.index_select(0, location.flatten()).unflatten(0, location.shape)
+        robots[..., REPAIR] |= belief[..., 0].gather(-1, location) < 1.0
         mask = robots[..., 0, :]
         for robot in range(1, self.num_robots):
             mask = (mask.unsqueeze(-1) & robots[..., robot, :].unsqueeze(-2)).flatten(-2)

@@ -84,15 +84,16 @@ class Scenarios(NamedTuple):
             count: number of trajectories of an estimate.
         """
         robots = names.shape[-1]
-        columns = []
+        columns, seen = [], self.seen
         for robot, name in enumerate(names.unbind(-1)):
-            first = (self.seen & _bit(name)) == 0
+            bit = _bit(name)
+            first, seen = (self.seen & bit) == 0, seen | bit
             noise = uniform(self.keys, torch.where(first, name, _STEPS + age * robots + robot))
             if count > 1:
                 slice_ = (self.members + (uniform(self.groups, name) * count).to(torch.int64)) % count
                 noise = torch.where(first, ((slice_ + noise) / count).clamp_max(_LARGEST), noise)
             columns.append(noise)
-        return torch.stack(columns, -1), self.observe(names)
+        return torch.stack(columns, -1), self._replace(seen=seen)
 
 
 def _bit(name: Tensor) -> Tensor:
