@@ -36,6 +36,7 @@ def main() -> None:
 
 def _draw(results: dict) -> None:
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     def points(name: str, unit: str) -> tuple[list[int], list[float]]:
         rows = [row for row in results[name]["rows"] if row["unit"] == unit]
@@ -55,6 +56,8 @@ def _draw(results: dict) -> None:
                 axes.loglog(x, [values[0] * size / x[0] for size in x], "--", color="#9aa5b1", label="linear")
                 axes.legend()
             axes.set_xticks(x, [f"{size:,}" for size in x], rotation=30)
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.yaxis.set_major_formatter("{x:,g}")
             axes.minorticks_off()
             axes.grid(alpha=0.3)
             figure.savefig(FOLDER / f"{name}.png")
