@@ -10,7 +10,7 @@ import torch
 
 from torchrl_pomdp import reproduce as module
 from torchrl_pomdp.evaluation import compare
-from torchrl_pomdp.reproduce import EXPERIMENTS, Experiment, comparison_table, plan, reproduce, settings_config
+from torchrl_pomdp.reproduce import EXPERIMENTS, OPTIMA, Experiment, comparison_table, plan, reproduce, settings_config
 
 TOY = Experiment("toy", ("line3",), ("pAPI-NT", "pAPI-T"))
 
@@ -32,6 +32,13 @@ def test_published_numbers_stand_beside_ours():
     found = {"greedy": compare(cost, cost), "pAPI-NT 2": compare(0.9 * cost, cost)}
     text = comparison_table({"run": ("grid5x4", found)})
     assert text.splitlines()[-1].endswith("| 0.900 | 0.900 … 0.900 | 4952.26 | 0.904 |")
+
+
+def test_a_known_optimum_stands_beside_the_costs():
+    cost = torch.full((4,), 1.02 * OPTIMA["line3"])
+    text = comparison_table({"run": ("line3", {"greedy": compare(cost, cost)})})
+    assert text.splitlines()[0].endswith(" over the optimum |")
+    assert text.splitlines()[-1].endswith("| 2.00 % ± 0.00 |")
 
 
 def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):

@@ -84,8 +84,9 @@ class Evaluate:
 class Reproduce:
     """Carry out one of the paper's experiments; the same command goes on with an interrupted one."""
 
-    experiment: tyro.conf.Positional[Literal["table1", "architectures", "ablation"]]
-    """table1: the grids and two robots; architectures: API, pAPI-NT and pAPI-T; ablation: rollout and iteration apart."""
+    experiment: tyro.conf.Positional[Literal["table1", "architectures", "ablation", "optimum"]]
+    """table1: the grids and two robots; architectures: API, pAPI-NT and pAPI-T; ablation: rollout and iteration apart; optimum:
+    the line of 3, whose optimal cost is known."""
 
     scale: float = 0.05
     """Fraction of the paper's samples; 1 is the paper's."""

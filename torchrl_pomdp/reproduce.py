@@ -19,7 +19,7 @@ from torchrl_pomdp.report import Result, cost_figure, effort, interval_text, ite
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.run import TrainingRun
 
-__all__ = ["EXPERIMENTS", "PUBLISHED", "Experiment", "plan", "reproduce", "settings_config"]
+__all__ = ["EXPERIMENTS", "OPTIMA", "PUBLISHED", "Experiment", "plan", "reproduce", "settings_config"]
 
 PUBLISHED = {
     ("grid5x4", "greedy"): 5476.79,
@@ -34,8 +34,11 @@ PUBLISHED = {
 }
 """Costs of the paper's Table I by problem and policy."""
 
+OPTIMA = {"line3": 168.97}
+"""Optimal costs of problems that are small enough to be solved, to two decimals (by a point-based solver)."""
+
 # Labelled states of each part in the paper.
-_SAMPLES = {"linear20": 200_000}
+_SAMPLES = {"linear20": 200_000, "line3": 200_000}
 _MORE_SAMPLES = 500_000
 
 
@@ -47,11 +50,13 @@ class Experiment:
         name: what the command calls it.
         problems: names of the problems.
         algorithms: names of the algorithms that learn.
+        states: start states of each evaluation.
     """
 
     name: str
     problems: tuple[str, ...]
     algorithms: tuple[Literal["pAPI-NT", "pAPI-T", "API"], ...]
+    states: int = 1000
 
 
 EXPERIMENTS = {
@@ -60,6 +65,8 @@ EXPERIMENTS = {
         Experiment("table1", ("grid5x4", "grid6x6", "two_robots20"), ("pAPI-NT",)),
         Experiment("architectures", ("linear20",), ("API", "pAPI-NT", "pAPI-T")),
         Experiment("ablation", ("linear20",), ("pAPI-NT", "pAPI-T")),
+        # Differences from the optimum are small, and so is the problem.
+        Experiment("optimum", ("line3",), ("pAPI-NT",), states=100_000),
     )
 }
 """The experiments by name."""
@@ -128,7 +135,8 @@ def plan(
             if algorithm == "API":
                 config = replace(config, samples_per_part=6 * config.samples_per_part)
             name = f"{problem}-{algorithm}-{settings}-{base}-scale{scale:g}-seed{seed}"
-            runs[name] = TrainingRun(problem, algorithm, base, config, online_trajectories=5 if settings == "tuned" else 10)
+            online = 5 if settings == "tuned" else 10
+            runs[name] = TrainingRun(problem, algorithm, base, config, experiment.states, experiment.states, online)
     return runs
 
 
@@ -221,10 +229,13 @@ def comparison_table(results: dict[str, tuple[str, dict[str, Comparison]]]) -> s
         |---|---|---|---|---|---|---|---|
         | grid5x4 | greedy | 2 | 15.0 ± 9.8 | 1.000 | 1.000 … 1.000 | 5476.79 | 1.000 |
     """
+    known = any(problem in OPTIMA for problem, _ in results.values())
     lines = [
         "| problem | policy | states | cost | ratio to greedy | 95 % interval | paper: cost | paper: ratio |",
         "|---|---|---|---|---|---|---|---|",
     ]
+    if known:
+        lines = [lines[0] + " over the optimum |", lines[1] + "---|"]
     for problem, found in results.values():
         for policy, comparison in found.items():
             published, greedy = PUBLISHED.get((problem, policy)), PUBLISHED.get((problem, "greedy"))
@@ -234,7 +245,17 @@ def comparison_table(results: dict[str, tuple[str, dict[str, Comparison]]]) -> s
                 f"| {problem} | {policy} | {comparison.cost.count} | {interval_text(comparison.cost)} | "
                 f"{comparison.ratio.mean:.3f} | {low:.3f} … {high:.3f} | {beside} |"
             )
+            if known:
+                lines[-1] += f" {_over_optimum(problem, comparison)} |"
     return "\n".join(lines)
+
+
+def _over_optimum(problem: str, comparison: Comparison) -> str:
+    """How much more than the optimum a policy costs, with its 95 % interval; empty where no optimum is known."""
+    if problem not in OPTIMA:
+        return ""
+    low, high = (100 * (cost / OPTIMA[problem] - 1) for cost in comparison.cost.interval)
+    return f"{(low + high) / 2:.2f} % ± {(high - low) / 2:.2f}"
 
 
 def effort_table(runs: dict[str, list[dict[str, Any]]]) -> str:
