@@ -19,7 +19,7 @@ def test_the_papers_settings_are_the_papers():
     config = settings_config("paper", "linear20", 1.0, seed=0)
     assert (config.samples_per_part, config.trajectories, config.hidden) == (200_000, 10, (256, 64))
     assert (config.value_hidden, config.loss, config.encoder) == ((256, 128, 64), "l2", "flat")
-    assert (config.learning_rate, config.visited_share, config.symmetries, config.iterations) == (1e-3, 0.1, False, 2)
+    assert (config.learning_rate, config.visited_share, config.symmetries, config.iterations) == (1e-3, 0.5, False, 2)
     assert settings_config("paper", "grid6x6", 1.0, seed=0).samples_per_part == 500_000
     runs = plan(EXPERIMENTS["architectures"], "paper", "greedy", 1.0, 0)
     assert {run.algorithm: run.config.samples_per_part for run in runs.values()} == {
