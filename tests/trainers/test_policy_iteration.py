@@ -13,11 +13,14 @@ from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import (
     GreedyRepair,
     NeverRepairCost,
+    OnEntering,
     PolicyCost,
     PolicyNetwork,
     RolloutPolicy,
+    SteadyStateCost,
     UrgencyRepair,
     ValueNetwork,
+    ZeroCost,
 )
 from torchrl_pomdp.objectives import ClassificationLoss
 from torchrl_pomdp.trainers import (
@@ -30,6 +33,8 @@ from torchrl_pomdp.trainers import (
     make_values,
     papi_nt,
     papi_t,
+    r_nt,
+    r_t,
     train_part,
 )
 from torchrl_pomdp.trainers import policy_iteration as module
@@ -266,8 +271,22 @@ def test_the_algorithms_refuse_partitions_that_do_not_fit(line3):
         api(line3, TINY, greedy)
     with pytest.raises(ValueError, match="at least two stages, problem 'line3' has 1"):
         papi_t(make_problem("line3", partitioned=False), TINY, greedy)
+    with pytest.raises(ValueError, match="R-T needs a partition of at least two stages"):
+        r_t(make_problem("line3", partitioned=False), greedy, ZeroCost())
     with pytest.raises(ValueError, match="plan is empty"):
         PolicyIteration(line3, TINY, greedy, [])
+
+
+def test_online_truncation_cuts_startgame_simulations_alone(linear20):
+    """As policy iteration with truncation labels: at the endgame's border, and not at all from within."""
+    model, greedy, values = linear20.model, GreedyRepair(linear20.model), SteadyStateCost(linear20.model)
+    y = torch.cat([model.with_features(states(torch.arange(20))) for states in linear20.training])
+    q = r_t(linear20, greedy, values, trajectories=2)(y.copy())["q_factors"]
+    cut = RolloutPolicy(model, greedy, truncation=OnEntering((3, 4, 5)), terminal_cost=values, trajectories=2)
+    startgame = y["partition"] < 3
+    assert torch.equal(q[startgame], cut.q_factors(y)[startgame])
+    assert torch.equal(q[~startgame], r_nt(linear20, greedy, trajectories=2).q_factors(y)[~startgame])
+    assert not torch.equal(q[~startgame], cut.q_factors(y)[~startgame])
 
 
 def test_value_networks_learn_costs_of_all_magnitudes(linear20):

@@ -4,7 +4,7 @@ r"""The paper's five algorithms, composed from the library's modules (Section VI
 name   learning   partition    what it is
 ====== ========== ============ =======================================================================
 R-NT   none       any          online one-step lookahead, simulations to the end
-R-T    none       any          the same, simulations cut, with a terminal cost
+R-T    none       N parts      the same, startgame simulations cut at the endgame, with a terminal cost
 API    networks   one part     policy iteration, one policy network
 pAPI-NT networks  N parts      policy iteration, N policy networks
 pAPI-T networks   N parts      the same, startgame simulations cut at the endgame, with its value networks
@@ -21,7 +21,7 @@ from typing import Any
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_pomdp.envs.presets import Problem
-from torchrl_pomdp.modules import OnEntering, RolloutPolicy, TerminalCost, Truncation
+from torchrl_pomdp.modules import OnEntering, PartitionedPolicy, RolloutPolicy, TerminalCost, Truncation
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.policy_iteration import Evaluate, Improve, PolicyIteration
 
@@ -47,32 +47,37 @@ def r_nt(problem: Problem, base_policy: TensorDictModuleBase, **options: Any) ->
     return RolloutPolicy(problem.model, base_policy, **options)
 
 
-def r_t(
-    problem: Problem,
-    base_policy: TensorDictModuleBase,
-    terminal_cost: TerminalCost,
-    truncation: Truncation,
-    **options: Any,
-) -> RolloutPolicy:
-    """Rollout with truncation: online, nothing is learnt.
+def r_t(problem: Problem, base_policy: TensorDictModuleBase, terminal_cost: TerminalCost, **options: Any) -> PartitionedPolicy:
+    r"""Rollout with truncation: online, nothing is learnt. It simulates as :func:`papi_t` does for its labels.
+
+    Where a simulation enters a part of an earlier stage, it ends with :math:`\alpha^m\hat J`; those that start in the first
+    stage are not cut, since with nothing but :math:`\hat J` after a single step its errors can make a robot walk back and forth
+    for ever.
 
     Args:
-        problem: the problem.
+        problem: the problem; its partition has at least two stages.
         base_policy: the base policy.
-        terminal_cost: cost at the cut.
-        truncation: when simulations are cut.
+        terminal_cost: :math:`\hat J`, read in the parts of all stages but the last.
         options: see :class:`~torchrl_pomdp.modules.RolloutPolicy`.
+
+    Raises:
+        ValueError: if the partition has one stage alone.
 
     Examples:
         >>> import torch
         >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import AfterSteps, GreedyRepair, SteadyStateCost
-        >>> problem = make_problem("line3")
-        >>> policy = r_t(problem, GreedyRepair(problem.model), SteadyStateCost(problem.model), AfterSteps(60))
-        >>> policy(problem.start(torch.arange(2)))["action"].shape
+        >>> from torchrl_pomdp.modules import GreedyRepair, SteadyStateCost
+        >>> problem = make_problem("linear20")
+        >>> policy = r_t(problem, GreedyRepair(problem.model), SteadyStateCost(problem.model), trajectories=2)
+        >>> policy(problem.model.with_features(problem.start(torch.arange(2))))["action"].shape
         torch.Size([2])
     """
-    return RolloutPolicy(problem.model, base_policy, truncation=truncation, terminal_cost=terminal_cost, **options)
+    local: dict[int, RolloutPolicy] = {}
+    for stage, truncation in _cut_stages(problem, "R-T"):
+        at_cut = None if truncation is None else terminal_cost
+        policy = RolloutPolicy(problem.model, base_policy, truncation=truncation, terminal_cost=at_cut, **options)
+        local |= dict.fromkeys(stage, policy)
+    return PartitionedPolicy([local[part] for part in sorted(local)])
 
 
 def papi_nt(
@@ -121,17 +126,22 @@ def papi_t(
         >>> [(type(step).__name__, step.parts) for step in plan]
         [('Improve', (3, 4, 5)), ('Evaluate', (3, 4, 5)), ('Improve', (0, 1, 2))]
     """
+    plan: list[Improve | Evaluate] = []
+    cuts = _cut_stages(problem, "pAPI-T")
+    for stage, truncation in cuts:
+        plan.append(Improve(stage, truncation))
+        if stage is not cuts[-1][0]:
+            plan.append(Evaluate(stage, truncation))
+    return PolicyIteration(problem, config, base_policy, plan, **options)
+
+
+def _cut_stages(problem: Problem, algorithm: str) -> list[tuple[tuple[int, ...], Truncation | None]]:
+    """The partition's stages, each with the rule that cuts its simulations where they enter an earlier one."""
     stages = problem.model.partition.stages if problem.model.partition is not None else ()
     if len(stages) < 2:
-        raise ValueError(f"pAPI-T needs a partition of at least two stages, problem {problem.name!r} has {len(stages)}")
-    plan: list[Improve | Evaluate] = []
-    entered: tuple[int, ...] = ()
-    for stage in stages:
-        plan.append(Improve(stage, OnEntering(entered) if entered else None))
-        if stage is not stages[-1]:
-            plan.append(Evaluate(stage, OnEntering(entered) if entered else None))
-        entered += stage
-    return PolicyIteration(problem, config, base_policy, plan, **options)
+        raise ValueError(f"{algorithm} needs a partition of at least two stages, problem {problem.name!r} has {len(stages)}")
+    earlier = [sum(stages[:number], ()) for number in range(len(stages))]
+    return [(stage, OnEntering(parts) if parts else None) for stage, parts in zip(stages, earlier, strict=True)]
 
 
 def api(problem: Problem, config: PolicyIterationConfig, base_policy: TensorDictModuleBase, **options: Any) -> PolicyIteration:

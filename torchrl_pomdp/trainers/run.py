@@ -133,9 +133,9 @@ class _Execution:
             if iteration.accepted:
                 save_checkpoint(self.folder / "best.pt", checkpoint)
                 best = name
-            if iteration.number == 1 and (truncation := training.plan[-1].truncation) is not None:
+            if iteration.number == 1 and run.algorithm == "pAPI-T":
                 # What the networks of the startgame have learnt from, played online.
-                truncated = r_t(self.problem, base, iteration.value, truncation, **online)
+                truncated = r_t(self.problem, base, iteration.value, **online)
                 self._compare(f"R-T of {run.base}", truncated, run.states)
             self._compare(name, iteration.policy, run.states)
             summaries.append(_summary(iteration))
