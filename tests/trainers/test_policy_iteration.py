@@ -6,6 +6,7 @@ from functools import partial
 
 import pytest
 import torch
+from torchrl.trainers import Trainer
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
 from torchrl_pomdp.envs import BeliefEnv, Problem, RepairModel, UniformStart, damage_chain, line, make_problem
@@ -170,6 +171,19 @@ def test_one_part_equals_the_unpartitioned_run_bit_for_bit():
     y = problem.model.with_features(problem.start(torch.arange(50)))
     with torch.no_grad():
         assert torch.equal(bare(y.copy())["logits"], iteration.policy(y.copy())["logits"])
+
+
+def test_training_keeps_no_graphs(line3, monkeypatch):
+    """TorchRL's trainer averages the losses of all steps; with their graphs the memory would grow with every step."""
+    kept = []
+    monkeypatch.setattr(Trainer, "_post_optim_complete_log_hook", lambda self, count, losses: kept.append(losses))
+    y = line3.model.with_features(line3.start(torch.arange(100)))
+    batch = RolloutPolicy(line3.model, GreedyRepair(line3.model), trajectories=1)(y)
+    policy = make_networks(line3, TINY, seed=0).policies[0]
+    train_part(batch, ClassificationLoss(policy), TINY, seed=0, name="part")
+    (losses,) = kept
+    assert losses.get("loss_policy") is not None
+    assert not any(loss.requires_grad for loss in losses.values())
 
 
 def test_mirror_images_are_training_data_of_their_parts(line3):

@@ -130,7 +130,8 @@ class _Stepper(DefaultOptimizationStepper):
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         if self.count == 0:
             self.bar = tqdm(total=self.steps, unit="step", desc=f"train {self.name}", disable=not self.progress, leave=False)
-        losses = super().step(trainer, sub_batch)
+        # The trainer averages them over all steps; with their graphs it would keep every step's memory.
+        losses = super().step(trainer, sub_batch).detach()
         self.schedule.step()
         self.count += 1
         if self.logger is not None and self.count % _LOG_INTERVAL == 0:
