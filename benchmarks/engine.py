@@ -28,7 +28,8 @@ def greedy(table: Table) -> None:
     rise = np.array([0, 0.02, 0.03, 0.05, 0], np.float32)
     repeats = 5
     # The loop overwrites what it is given.
-    inputs = iter([(_rows(y["belief"]), y["location"][:, 0].numpy().copy()) for _ in range(repeats + 2)])
+    belief, place = y["belief"].transpose(1, 2).contiguous().numpy(), y["location"][:, 0].numpy()
+    inputs = iter([(belief.copy(), place.copy()) for _ in range(repeats + 2)])
 
     def loop():
         return greedy_rollout(
@@ -46,11 +47,6 @@ def greedy(table: Table) -> None:
         table.add(f"greedy rollout, {name}", steps / time_ / 1e6, "M steps/s")
         table.add(f"greedy rollout, {name}, over the numba loop", reference / time_, target=target)
         table.add(f"greedy rollout, {name}: largest difference of a cost from the loop's", float(error), "cost")
-
-
-def _rows(belief: torch.Tensor) -> np.ndarray:
-    """Beliefs ``[N, L, K]`` as the loop wants them, ``[N, K, L]``."""
-    return belief.transpose(1, 2).contiguous().numpy().copy()
 
 
 def batch(table: Table) -> None:
@@ -183,6 +179,6 @@ def env_step(table: Table) -> None:
     with threads(1):
         # Both leave their result where the last one was.
         bare, step = seconds(
-            lambda: y.set("bare", problem.model.advance(core, y["action"], noise)[1]), lambda: env.step(y), repeats=61
+            lambda: y.set("bare", problem.model.advance(core, y["action"], noise)[1]), partial(env.step, y), repeats=61
         )
     table.add("env.step over the bare model step, 16 384 rows", step / bare, target="<= 1.15")

@@ -136,8 +136,15 @@ def plan(
             if algorithm == "API":
                 config = replace(config, samples_per_part=6 * config.samples_per_part)
             name = f"{problem}-{algorithm}-{settings}-{base}-scale{scale:g}-seed{seed}"
-            online = 5 if settings == "tuned" else 10
-            runs[name] = TrainingRun(problem, algorithm, base, config, experiment.states, experiment.states, online)
+            runs[name] = TrainingRun(
+                problem,
+                algorithm,
+                base,
+                config,
+                states=experiment.states,
+                online_states=experiment.states,
+                online_trajectories=5 if settings == "tuned" else 10,
+            )
     return runs
 
 

@@ -256,7 +256,7 @@ class BeliefEnv(EnvBase):
 
     The batch is free by default (``batch_size=()``, any TensorDict batch is accepted) or fixed. Legal controls are in
     ``"action_mask"``; :meth:`rand_action` obeys it. An illegal control raises. States enter through
-    ``reset(y, set_state=True)``.
+    ``reset(y, set_state=True)``, which computes the mask and ``"terminated"``; ``step`` reads them.
 
     ============== ============ ==========================================
     key            shape        meaning

@@ -133,7 +133,7 @@ class _Execution:
             if iteration.accepted:
                 save_checkpoint(self.folder / "best.pt", checkpoint)
                 best = name
-            if iteration.number == 1 and run.algorithm == "pAPI-T":
+            if iteration.number == 1 and training.plan[-1].truncation is not None:
                 # What the networks of the startgame have learnt from, played online.
                 truncated = r_t(self.problem, base, iteration.value, **online)
                 self._compare(f"R-T of {run.base}", truncated, run.states)
