@@ -19,7 +19,7 @@ from torchrl_pomdp.trainers.checkpoint import load_checkpoint
 
 TINY = (
     "--iterations 1 --samples-per-part 60 --trajectories 2 --epochs 1 --least-steps 1 --batch-size 30 --max-steps 60 "
-    "--states 20 --validation-states 30 --visits 50 --value-samples 50"
+    "--states 20 --validation-states 30 --visits-per-label 0.2 --value-samples 50"
 )
 
 

@@ -49,7 +49,7 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
             "trajectories": 2,
             "epochs": 1,
             "least_steps": 1,
-            "visits": 20,
+            "visits_per_label": 0.1,
             "max_steps": 60,
         }
         return replace(settings_config(settings, problem, scale, seed), iterations=1, validation_states=20, **small)

@@ -52,7 +52,7 @@ TINY = PolicyIterationConfig(
     hidden=(16,),
     value_hidden=(16,),
     max_steps=60,
-    visits=100,
+    visits_per_label=0.1,
     validation_states=100,
 )
 
@@ -66,7 +66,8 @@ def weights(policy):
 
 
 def test_policy_iteration_improves_greedy_on_the_line_of_3(line3):
-    config = replace(TINY, samples_per_part=1500, trajectories=10, epochs=30, hidden=(256, 64), max_steps=400, visits=2000)
+    config = replace(TINY, samples_per_part=1500, trajectories=10, epochs=30, hidden=(256, 64), max_steps=400)
+    config = replace(config, visits_per_label=0.2)
     iteration = papi_nt(line3, replace(config, validation_states=4000), GreedyRepair(line3.model))
     (only,) = iteration
     assert only.accepted
@@ -306,7 +307,8 @@ def test_online_truncation_cuts_startgame_simulations_alone(linear20):
 def test_value_networks_learn_costs_of_all_magnitudes(linear20):
     """A value network of the endgame, trained as policy iteration does it, against fresh simulations."""
     model, greedy = linear20.model, GreedyRepair(linear20.model)
-    config = replace(TINY, value_samples=6000, value_hidden=(64, 32), epochs=10, batch_size=100, max_steps=400, visits=500)
+    config = replace(TINY, value_samples=6000, value_hidden=(64, 32), epochs=10, batch_size=100, max_steps=400)
+    config = replace(config, visits_per_label=0.4)
     algorithm = PolicyIteration(linear20, config, greedy, [Evaluate((4,))])
     (iteration,) = algorithm
     value = iteration.value
@@ -331,8 +333,8 @@ def test_models_without_a_partition_are_refused():
     "change",
     [
         {"iterations": 0}, {"samples_per_part": 0}, {"trajectories": 0}, {"max_steps": 0}, {"batch_size": 0},
-        {"visits": 0}, {"memory_capacity": 0}, {"value_samples": 0}, {"validation_states": 0}, {"value_hidden": (0,)},
-        {"epochs": 0}, {"least_steps": 0}, {"visited_share": 1.5},
+        {"visits_per_label": 0.0}, {"memory_capacity": 0}, {"value_samples": 0}, {"validation_states": 0},
+        {"value_hidden": (0,)}, {"epochs": 0}, {"least_steps": 0}, {"visited_share": 1.5},
         {"exploration": -0.1}, {"learning_rate": 0.0}, {"hidden": ()},
     ],
 )  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Literal
 __all__ = ["PolicyIterationConfig"]
 
 _POSITIVE = (
-    "iterations", "samples_per_part", "trajectories", "max_steps", "visits", "memory_capacity", "value_samples",
+    "iterations", "samples_per_part", "trajectories", "max_steps", "memory_capacity", "value_samples",
     "batch_size", "epochs", "least_steps", "validation_states",
 )  # fmt: skip
 
@@ -49,13 +49,14 @@ class PolicyIterationConfig:
     visited_share: float = 0.7
     """Share of the training states taken from the memory of visited states, in [0, 1]; the rest are random."""
 
-    visits: int = 20_000
-    """Trajectories of the base policy, and of each iteration's, of whose states the memory retains a tenth."""
+    visits_per_label: float = 0.7
+    """Trajectories of the base policy, and of each iteration's, for each labelled state of an iteration; the memory retains a
+    tenth of their states. With few of them the same states are labelled again and again."""
 
     exploration: float = 0.15
     """Probability of a random control at each stage of those trajectories, in [0, 1]."""
 
-    memory_capacity: int = 100_000
+    memory_capacity: int = 500_000
     """Largest number of states of a part in the memory."""
 
     symmetries: bool = True
@@ -101,8 +102,9 @@ class PolicyIterationConfig:
         for name in ("visited_share", "exploration"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        if not self.learning_rate > 0.0:
-            raise ValueError(f"learning_rate must be positive, got {self.learning_rate}")
+        for name in ("visits_per_label", "learning_rate"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("hidden", "value_hidden"):
             sizes = getattr(self, name)
             if not sizes or min(sizes) < 1:

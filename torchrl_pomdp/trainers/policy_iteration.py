@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -334,8 +335,10 @@ class PolicyIteration:
 
     def _visit(self, policy: TensorDictModuleBase, number: int) -> None:
         """Remember states that an iteration's policy visits, also a rejected one's: there the next one can do better."""
-        keys = seed_keys(self._seed(number, "visits"), torch.arange(self.config.visits, device=self.problem.model.device))
-        self.memory.visit(policy, self.problem.start, keys, exploration=self.config.exploration)
+        config = self.config
+        count = math.ceil(config.visits_per_label * config.samples_per_part * self.partition.num_parts)
+        keys = seed_keys(self._seed(number, "visits"), torch.arange(count, device=self.problem.model.device))
+        self.memory.visit(policy, self.problem.start, keys, exploration=config.exploration, max_steps=config.max_steps)
 
     def _validate(self, policy: TensorDictModuleBase, name: str) -> torch.Tensor:
         problem, config = self.problem, self.config

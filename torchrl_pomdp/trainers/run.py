@@ -42,7 +42,7 @@ class TrainingRun:
 
     Examples:
         >>> import tempfile
-        >>> config = PolicyIterationConfig(1, samples_per_part=40, least_steps=1, validation_states=50, visits=20)
+        >>> config = PolicyIterationConfig(1, samples_per_part=40, least_steps=1, validation_states=50)
         >>> run = TrainingRun("line3", config=config, states=20, online_states=0)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     list(run.carry_out(Path(folder) / "run"))
