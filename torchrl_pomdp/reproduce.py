@@ -77,7 +77,7 @@ def settings_config(settings: Literal["paper", "tuned"], problem: str, scale: fl
 
     Args:
         settings: ``"paper"``: two iterations, 10 trajectories, flattened beliefs, squared error, no exploration, no mirror
-            images. The paper leaves open the share of states from the memory and the number of epochs: a half and 50.
+            images. The paper leaves open the share of states from the memory, a half here, and the number of epochs.
             ``"tuned"``: the configuration's defaults, what has worked best here.
         problem: name of the problem.
         scale: fraction of the paper's samples, positive.
@@ -100,7 +100,6 @@ def settings_config(settings: Literal["paper", "tuned"], problem: str, scale: fl
         common,
         iterations=2,
         trajectories=10,
-        epochs=50,
         encoder="flat",
         loss="l2",
         visited_share=0.5,
