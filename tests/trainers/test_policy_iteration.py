@@ -224,6 +224,18 @@ def test_states_of_every_iterations_policy_are_remembered(line3, monkeypatch):
     assert seen == [base, iterations[0].policy, iterations[1].policy], "of the last one no iteration would learn"
 
 
+def test_visited_states_keep_pace_with_labels(linear20):
+    """A part's memory holds about as many states as it has labels, so that few are labelled twice."""
+    counts = []
+    for samples in (100, 400):
+        config = replace(PolicyIterationConfig(), iterations=1, samples_per_part=samples, least_steps=1, validation_states=10)
+        run = PolicyIteration(linear20, config, GreedyRepair(linear20.model), [Improve((3,))])
+        next(iter(run))
+        counts.append([run.memory.count(part) / samples for part in range(6)])
+    assert min(counts[0] + counts[1]) > 0.5
+    assert counts[1] == pytest.approx(counts[0], rel=0.3)
+
+
 class Killed(BaseException):
     """Stands for SIGKILL: nothing catches it."""
 
