@@ -15,7 +15,7 @@ import torch
 from benchmarks.harness import Table, seconds, threads
 from benchmarks.setting import Counting, line_problem, linear20, network_flops, networks
 from torchrl_pomdp.envs import BeliefEnv
-from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout
+from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout, ZeroCost
 
 
 def greedy(table: Table) -> None:
@@ -126,9 +126,10 @@ def locations(table: Table) -> None:
             keys = torch.arange(16_384 * 20 // size)
             y = start(keys)
             # The same number of bytes at once, whatever the size.
-            rollout = TruncatedRollout(model, GreedyRepair(model), max_steps=40, chunk_rows=len(keys))
+            cut = partial(TruncatedRollout, model, max_steps=40, terminal_cost=ZeroCost(), chunk_rows=len(keys))
+            rollout = cut(GreedyRepair(model))
             policy = Counting(GreedyRepair(model))
-            TruncatedRollout(model, policy, max_steps=40, chunk_rows=len(keys))(y, keys)
+            cut(policy)(y, keys)
             step = seconds(partial(rollout, y, keys))[0] / policy.rows
             table.add(f"greedy step, L = {size}", step * 1e9, "ns")
             base = base or step
@@ -139,7 +140,7 @@ _MEMORY = """
 import sys, torch
 from pathlib import Path
 from benchmarks.setting import line_problem
-from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout
+from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout, ZeroCost
 torch.set_num_threads(1)
 # The peak of this program alone; what `resource` tells includes that of the one which has started it.
 peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
@@ -148,9 +149,9 @@ model, start = line_problem(20, drift=0.01)
 keys = torch.arange(rows)
 # Few different states, so that making them takes no memory to speak of.
 y = start(torch.arange(1024))[keys % 1024]
-TruncatedRollout(model, GreedyRepair(model), max_steps=2, chunk_rows=64)(y[:64], keys[:64])
+TruncatedRollout(model, GreedyRepair(model), max_steps=2, terminal_cost=ZeroCost(), chunk_rows=64)(y[:64], keys[:64])
 before = peak()
-TruncatedRollout(model, GreedyRepair(model), max_steps=steps, chunk_rows=rows)(y, keys)
+TruncatedRollout(model, GreedyRepair(model), max_steps=steps, terminal_cost=ZeroCost(), chunk_rows=rows)(y, keys)
 print((peak() - before) * 1024)
 """
 

@@ -32,7 +32,7 @@ def test_collecting_and_training_stay_on_the_device():
         states=PartSampler(dict(enumerate(problem.training)), seed=0),
         frames_per_batch=60,
         total_frames=60,
-        label=lambda model, base: RolloutPolicy(model, base, trajectories=2, max_steps=30),
+        label=lambda model, base: RolloutPolicy(model, base, trajectories=2),
     )
     batch = next(iter(collector))
     assert all(leaf.is_cuda for leaf in batch.values(include_nested=True, leaves_only=True))

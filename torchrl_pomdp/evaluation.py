@@ -10,7 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
-from torchrl_pomdp.modules.rollout import Policy, TruncatedRollout
+from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.noise import fold, seed_keys
 
 __all__ = ["Comparison", "Estimate", "compare", "discounted_costs", "estimate"]
@@ -63,6 +63,7 @@ def discounted_costs(
     num_states: int = 1000,
     seed: int = 0,
     max_steps: int = 400,
+    terminal_cost: TerminalCost | None = None,
     progress: bool = False,
     name: str = "evaluate",
 ) -> Tensor:
@@ -79,6 +80,7 @@ def discounted_costs(
         num_states: number of start states.
         seed: seed of the start states and of the noise.
         max_steps: stages after which a trajectory is cut.
+        terminal_cost: what a cut adds, see :class:`TruncatedRollout`.
         progress: whether to show a progress bar, which counts decisions.
         name: label of the progress bar.
 
@@ -86,7 +88,7 @@ def discounted_costs(
         costs ``[num_states]``.
 
     Raises:
-        ValueError: if ``num_states`` is not positive.
+        ValueError: if ``num_states`` is not positive, or by :class:`TruncatedRollout`.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -100,7 +102,7 @@ def discounted_costs(
         raise ValueError(f"num_states must be at least 1, got {num_states}")
     keys = seed_keys(seed, torch.arange(num_states, device=model.device))
     with tqdm(unit="step", unit_scale=True, desc=name, disable=not progress, leave=False) as bar:
-        cost = TruncatedRollout(model, _Watched(policy, bar), max_steps=max_steps)
+        cost = TruncatedRollout(model, _Watched(policy, bar), max_steps=max_steps, terminal_cost=terminal_cost)
         return cost(start(fold(keys, 0)), fold(keys, 1))
 
 

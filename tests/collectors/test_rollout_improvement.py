@@ -9,9 +9,9 @@ from torchrl.envs import PendulumEnv
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
 from torchrl_pomdp.envs import BeliefEnv, FixedBelief, make_problem, tiger
-from torchrl_pomdp.modules import GreedyRepair, RolloutPolicy
+from torchrl_pomdp.modules import GreedyRepair, RolloutPolicy, ZeroCost
 
-LABEL = partial(RolloutPolicy, trajectories=2, max_steps=80)
+LABEL = partial(RolloutPolicy, trajectories=2, max_steps=80, terminal_cost=ZeroCost())
 
 
 def make_env():

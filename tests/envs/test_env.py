@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_pomdp.envs import BeliefEnv, FixedBelief, make_problem, tiger
-from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout
+from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout, ZeroCost
 from torchrl_pomdp.modules.scenarios import Scenarios
 
 
@@ -74,7 +74,7 @@ def test_environment_and_engine_walk_the_same_trajectory(linear20, monkeypatch):
     cost = -(rollout["next", "reward"].squeeze(-1) * model.discount ** torch.arange(20)).sum(1)
 
     monkeypatch.setattr(Scenarios, "draw", lambda self, age, names, count: (torch.stack(noise)[age, self.keys], self))
-    engine = TruncatedRollout(model, greedy, max_steps=20)(y, torch.arange(16))
+    engine = TruncatedRollout(model, greedy, max_steps=20, terminal_cost=ZeroCost())(y, torch.arange(16))
     torch.testing.assert_close(engine, cost, rtol=1e-5, atol=0)
     state = model.with_features(y)
     for step in range(20):

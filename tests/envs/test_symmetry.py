@@ -7,7 +7,7 @@ import torch
 from _oracles import random_states, small_model
 
 from torchrl_pomdp.envs import Graph, RepairPartition, grid, line, symmetries
-from torchrl_pomdp.modules import GreedyRepair, RolloutPolicy
+from torchrl_pomdp.modules import GreedyRepair, NeverRepairCost, RolloutPolicy
 
 CASES = [(line(4), 1, 2), (grid(3, 2), 1, 4), (grid(2, 2), 1, 8), (line(3), 2, 4), (grid(2, 1), 3, 12)]
 
@@ -56,7 +56,9 @@ def test_images_of_labels_are_labels_of_images():
     model = small_model(line(4), dtype=torch.float64)
     y = model.with_features(random_states(model, 20, 1))
     mirror = symmetries(model)[1]
-    policy = RolloutPolicy(model, GreedyRepair(model), trajectories=4000, leaves="observation", max_steps=40)
+    policy = RolloutPolicy(
+        model, GreedyRepair(model), trajectories=4000, leaves="observation", max_steps=40, terminal_cost=NeverRepairCost(model)
+    )
     labelled = mirror(policy(y))
     again = policy(mirror(y))
     ties = (labelled["q_factors"] - again["q_factors"]).nan_to_num(0.0).abs()

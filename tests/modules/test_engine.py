@@ -178,7 +178,7 @@ def test_adaptive_allocation_with_exact_first_observations():
     def listen(y):
         return y.set("action", torch.zeros(y.batch_size, dtype=torch.int64))
 
-    policy = RolloutPolicy(tiger(), listen, trajectories=6, allocation="adaptive", leaves="observation", max_steps=30)
+    policy = RolloutPolicy(tiger(), listen, trajectories=6, allocation="adaptive", leaves="observation", max_steps=80)
     assert policy(TensorDict(y, [2]))["action"].tolist() == [0, 2]
 
 

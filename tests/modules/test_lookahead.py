@@ -11,6 +11,7 @@ from torchrl_pomdp.envs import BeliefEnv, FixedBelief, RepairModel, UniformStart
 from torchrl_pomdp.modules import (
     FlatEncoder,
     GreedyRepair,
+    NeverRepairCost,
     PartitionedPolicy,
     PolicyNetwork,
     RelativeEncoder,
@@ -77,7 +78,8 @@ def test_labels_do_not_depend_on_batch_order_or_chunks(linear20):
         for leaves in ("control", "observation"):
 
             def q(y, chunk_rows=8192, base=base, leaves=leaves):
-                policy = RolloutPolicy(model, base, trajectories=3, leaves=leaves, chunk_rows=chunk_rows, max_steps=60)
+                options = {"max_steps": 60, "terminal_cost": NeverRepairCost(model)}
+                policy = RolloutPolicy(model, base, trajectories=3, leaves=leaves, chunk_rows=chunk_rows, **options)
                 return policy.q_factors(y)
 
             reference = q(y)
@@ -92,7 +94,7 @@ def test_labels_do_not_depend_on_batch_order_or_chunks(linear20):
 def test_labels_of_a_tabular_model_do_not_depend_on_the_batch():
     belief = torch.rand(40, 1, generator=torch.Generator().manual_seed(0))
     y = TensorDict({"belief": torch.cat([belief, 1 - belief], -1)}, [40])
-    policy = RolloutPolicy(tiger(), ListenThenOpen(0.9), trajectories=3, max_steps=60)
+    policy = RolloutPolicy(tiger(), ListenThenOpen(0.9), trajectories=3, max_steps=80)
     reference = policy.q_factors(y)
     assert torch.equal(torch.cat([policy.q_factors(part) for part in y.split(7)]), reference)
 
@@ -179,7 +181,7 @@ def test_plain_callables_are_policies_too(line3):
         return y.set("action", y["action_mask"].to(torch.int64).argmax(-1))
 
     y = line3.start(torch.arange(5))
-    cost = TruncatedRollout(line3.model, first_legal, max_steps=10)(y, torch.arange(5))
+    cost = TruncatedRollout(line3.model, first_legal)(y, torch.arange(5))
     assert (cost > 0).all()
     assert RolloutPolicy(line3.model, first_legal, trajectories=2)(y)["action"].shape == (5,)
 

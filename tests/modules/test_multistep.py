@@ -109,7 +109,7 @@ def test_tiger_listens_until_it_knows():
     def listen(y):
         return y.set("action", torch.zeros(y.batch_size, dtype=torch.int64))
 
-    rollout = RolloutPolicy(model, listen, trajectories=1, leaves="observation", max_steps=60)
+    rollout = RolloutPolicy(model, listen, trajectories=1, leaves="observation", max_steps=80)
     y = model.with_features(random_tiger([0.5, 0.85, 0.998, 0.002]))
     assert MultistepLookahead(rollout, 3)(y)["action"].tolist() == [0, 0, 2, 1]
 

@@ -82,7 +82,7 @@ def test_realised_costs_with_independent_noise_make_rollout_worse_than_greedy(li
     model, greedy = linear20.model, GreedyRepair(linear20.model)
     naive = _NaiveRollout(model, greedy, trajectories=10)
     baseline = discounted_costs(model, greedy, linear20.start, num_states=24)
-    comparison = compare(discounted_costs(model, naive, linear20.start, num_states=24, max_steps=120), baseline)
+    comparison = compare(discounted_costs(model, naive, linear20.start, num_states=24), baseline)
     assert comparison.difference.interval[0] > 0
 
 
@@ -165,6 +165,8 @@ def test_costs_do_not_depend_on_the_batch(linear20, size):
 def test_bad_numbers_are_refused(line3):
     with pytest.raises(ValueError, match="max_steps"):
         TruncatedRollout(line3.model, GreedyRepair(line3.model), max_steps=0)
+    with pytest.raises(ValueError, match=r"max_steps=10 needs a terminal_cost, got None: what is cut weighs 0.9 of a stage"):
+        TruncatedRollout(line3.model, GreedyRepair(line3.model), max_steps=10)
     with pytest.raises(ValueError, match="damage_threshold"):
         GreedyRepair(line3.model, damage_threshold=1.0)
     with pytest.raises(ValueError, match="robots must be 1 locations"):

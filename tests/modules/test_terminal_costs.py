@@ -75,7 +75,7 @@ def test_zero_is_zero_for_any_model_and_the_cut_rollout_is_the_sum_of_its_stage_
 
 def functions(model):
     greedy = GreedyRepair(model)
-    policy_cost = PolicyCost(model, greedy, trajectories=13, max_steps=40, chunk_rows=64)
+    policy_cost = PolicyCost(model, greedy, trajectories=13, max_steps=40, terminal_cost=NeverRepairCost(model), chunk_rows=64)
     return {
         "zero": ZeroCost().costs,
         "steady": SteadyStateCost(model).costs,
@@ -131,7 +131,7 @@ def test_trajectories_are_stratified():
 @pytest.mark.parametrize("use", ["labels", "terminal cost"])
 def test_a_policys_cost_does_not_depend_on_threads(linear20, use):
     model, greedy, y = linear20.model, GreedyRepair(linear20.model), linear20.start(torch.arange(8))
-    cost = PolicyCost(model, greedy, trajectories=2, max_steps=30)
+    cost = PolicyCost(model, greedy, trajectories=2, max_steps=30, terminal_cost=ZeroCost())
     options = {"trajectories": 2, "truncation": OnEntering((3, 4, 5)) | AfterSteps(20), "terminal_cost": cost.costs}
     run = cost.costs if use == "labels" else RolloutPolicy(model, greedy, **options).q_factors
     before = torch.get_num_threads()
@@ -157,7 +157,7 @@ def test_a_truncated_policy_cost_ends_with_its_terminal_cost(linear20):
 
 def test_labels_are_added_to_the_states_and_can_be_trained_on(linear20):
     y = linear20.start(torch.arange(4)).reshape(2, 2)
-    labelled = PolicyCost(linear20.model, GreedyRepair(linear20.model), max_steps=9)(y)
+    labelled = PolicyCost(linear20.model, GreedyRepair(linear20.model))(y)
     assert labelled is y
     weight = torch.ones(2, requires_grad=True)
     (labelled["cost_to_go"] @ weight).sum().backward()

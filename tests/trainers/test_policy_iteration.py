@@ -155,9 +155,8 @@ def test_one_part_equals_the_unpartitioned_run_bit_for_bit():
     algorithm = api(problem, config, greedy)
     (iteration,) = algorithm
     bare = make_networks(problem, config, algorithm._seed(1, "weights")).policies[0]
-    label = partial(
-        RolloutPolicy, trajectories=config.trajectories, max_steps=config.max_steps, seed=algorithm._seed(1, "labels")
-    )
+    cut = {"max_steps": config.max_steps, "terminal_cost": NeverRepairCost(problem.model)}
+    label = partial(RolloutPolicy, trajectories=config.trajectories, seed=algorithm._seed(1, "labels"), **cut)
     collector = RolloutImprovement(
         BeliefEnv(problem.model, problem.start),
         greedy,

@@ -26,6 +26,8 @@ them as ``"state_value"`` ``[*B]`` (costs, lower is better). ``in_keys``, where 
 
 # Default of `chunk_rows`, wherever a rollout is made. No power of two: planes that lie so far apart compete for cache lines.
 CHUNK_ROWS = 16_000
+# Discount of a stage beyond which costs may be left out.
+_INSIGNIFICANT = 0.02
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
 _RENEW_FRACTION = 0.15
 
@@ -88,8 +90,8 @@ class TruncatedRollout(nn.Module):
     Keyword Args:
         max_steps: the largest m.
         truncation: rule that cuts trajectories earlier, see :mod:`~torchrl_pomdp.modules.truncation`; None: never.
-        terminal_cost: :math:`\hat J`, added at the cut; None is zero, right where only ``max_steps`` cuts and is large
-            enough for discounting or the terminal states to make the rest insignificant.
+        terminal_cost: :math:`\hat J`, added at the cut. None leaves the rest out, which is refused unless only
+            ``max_steps`` cuts and discounting has made the rest insignificant by then, :math:`\alpha^m\le 0.02`.
         chunk_rows: largest number of trajectories simulated at once; bounds the memory, never changes the result. Powers of
             two are slower: planes that lie so far apart compete for the same lines of the cache.
         compile: whether to fuse policy and belief step by ``torch.compile``, see :func:`~.compiling.compiled`; worth its
@@ -99,8 +101,8 @@ class TruncatedRollout(nn.Module):
         simulated_steps: belief steps made so far.
 
     Raises:
-        ValueError: if ``max_steps`` or ``chunk_rows`` is not positive, if there is a truncation rule without a terminal
-            cost, or if the rule does not fit the model; when called, if the terminal cost has the wrong shape.
+        ValueError: if ``max_steps`` or ``chunk_rows`` is not positive, if a cut needs a terminal cost and there is none, or if
+            the truncation rule does not fit the model; when called, if the terminal cost has the wrong shape.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -141,9 +143,9 @@ class TruncatedRollout(nn.Module):
         for name, value in (("max_steps", max_steps), ("chunk_rows", chunk_rows)):
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
+        if terminal_cost is None:
+            _check_rest(model, max_steps, truncation)
         if truncation is not None:
-            if terminal_cost is None:
-                raise ValueError("truncation needs a terminal_cost, got None: a cut adds it; pass ZeroCost() to add nothing")
             truncation.check_model(model)
         self.model, self.base_policy, self.truncation = model, base_policy, truncation
         self.max_steps, self.terminal_cost, self.chunk_rows = max_steps, terminal_cost, chunk_rows
@@ -237,6 +239,18 @@ class TruncatedRollout(nn.Module):
             y = self.model.with_features(take_rows(live.y, index), _read_by(terminal_cost))
             cost = terminal_costs(terminal_cost, y) * self._discounts[live.age[index]]
             total.index_add_(0, live.number[index], cost)
+
+
+def _check_rest(model: BeliefModel, max_steps: int, truncation: Truncation | None) -> None:
+    """Raise if what a cut leaves out, without a terminal cost, may matter."""
+    if truncation is not None:
+        raise ValueError("truncation needs a terminal_cost, got None: a cut adds it; pass ZeroCost() to add nothing")
+    weight = model.discount**max_steps
+    if weight > _INSIGNIFICANT:
+        raise ValueError(
+            f"max_steps={max_steps} needs a terminal_cost, got None: what is cut weighs {weight:.2g} of a stage, more than "
+            f"{_INSIGNIFICANT}; pass ZeroCost() to add nothing"
+        )
 
 
 def _read_by(reader: Policy | TerminalCost) -> tuple[str, ...] | None:

@@ -314,9 +314,12 @@ class PolicyIteration:
     ) -> RolloutImprovement | PolicyEvaluation:
         """Collector of the labelled states of a part, all in one batch."""
         config, problem = self.config, self.problem
-        simulation: dict[str, Any] = {"max_steps": config.max_steps, "seed": self._seed(number, "labels", part)}
-        if step.truncation is not None:
-            simulation |= {"truncation": step.truncation, "terminal_cost": value}
+        simulation: dict[str, Any] = {
+            "max_steps": config.max_steps,
+            "truncation": step.truncation,
+            "terminal_cost": value,
+            "seed": self._seed(number, "labels", part),
+        }
         states = training_states(problem, self.memory, part, visited_share=config.visited_share)
         samples = config.samples_per_part if isinstance(step, Improve) else config.value_samples
         options: dict[str, Any] = {
@@ -349,6 +352,7 @@ class PolicyIteration:
             num_states=config.validation_states,
             seed=self._seed(0, "validation"),
             max_steps=config.max_steps,
+            terminal_cost=self._scale,
             progress=self.progress,
             name=f"validate {name}",
         )

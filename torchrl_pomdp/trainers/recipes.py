@@ -57,7 +57,7 @@ def r_t(problem: Problem, base_policy: TensorDictModuleBase, terminal_cost: Term
     Args:
         problem: the problem; its partition has at least two stages.
         base_policy: the base policy.
-        terminal_cost: :math:`\hat J`, read in the parts of all stages but the last.
+        terminal_cost: :math:`\hat J`; but for trajectories that do not end, read in the parts of all stages but the last.
         options: see :class:`~torchrl_pomdp.modules.RolloutPolicy`.
 
     Raises:
@@ -74,8 +74,7 @@ def r_t(problem: Problem, base_policy: TensorDictModuleBase, terminal_cost: Term
     """
     local: dict[int, RolloutPolicy] = {}
     for stage, truncation in _cut_stages(problem, "R-T"):
-        at_cut = None if truncation is None else terminal_cost
-        policy = RolloutPolicy(problem.model, base_policy, truncation=truncation, terminal_cost=at_cut, **options)
+        policy = RolloutPolicy(problem.model, base_policy, truncation=truncation, terminal_cost=terminal_cost, **options)
         local |= dict.fromkeys(stage, policy)
     return PartitionedPolicy([local[part] for part in sorted(local)])
 

@@ -16,7 +16,7 @@ from torchrl.record import CSVLogger
 from torchrl_pomdp.envs import Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import load_tensors, save_tensors, write_json
-from torchrl_pomdp.modules import GreedyRepair, Policy, UrgencyRepair
+from torchrl_pomdp.modules import GreedyRepair, NeverRepairCost, Policy, UrgencyRepair
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, save_checkpoint
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.policy_iteration import Iteration
@@ -166,6 +166,7 @@ class _Execution:
             self.problem.start,
             num_states=states,
             seed=EVALUATION_SEED,
+            terminal_cost=NeverRepairCost(self.problem.model),
             progress=self.progress,
             name=f"evaluate {name}",
         ).cpu()
