@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tqdm import tqdm
 
 from torchrl_pomdp import reproduce as module
 from torchrl_pomdp.evaluation import compare
@@ -42,6 +43,15 @@ def test_a_known_optimum_stands_beside_the_costs():
 
 
 def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
+    bars = []
+
+    class Bar(tqdm):
+        def __exit__(self, *exc):
+            bars.append(None if self.disable else (self.total, self.n, self.initial))
+            super().__exit__(*exc)
+
+    monkeypatch.setattr(module, "tqdm", Bar)
+
     def tiny(settings, problem, scale, seed):
         small = {
             "samples_per_part": 40,
@@ -60,7 +70,7 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
         module, "plan", lambda *args: {k: replace(r, states=10, online_states=5) for k, r in original(*args).items()}
     )
     folders = {"runs": tmp_path / "runs", "out": tmp_path / "results"}
-    text = reproduce(TOY, scale=0.001, base="urgency", **folders)
+    text = reproduce(TOY, scale=0.001, base="urgency", progress=True, **folders)
     stem = "toy-tuned-urgency-scale0.001-seed0"
     content = json.loads((tmp_path / "results" / f"{stem}.json").read_text())
     assert content["provenance"]["versions"]["torch"] == torch.__version__
@@ -72,8 +82,12 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
     pictures = {path.name.removeprefix(stem) for path in (tmp_path / "results").glob("*.png")}
     assert pictures == {"-iterations.png", "-time.png", "-line3-pAPI-NT.png", "-line3-pAPI-T.png"}
     before = (tmp_path / "results" / f"{stem}.json").read_bytes()
-    assert reproduce(TOY, scale=0.001, base="urgency", **folders) == text
+    assert reproduce(TOY, scale=0.001, base="urgency", progress=True, **folders) == text
     assert (tmp_path / "results" / f"{stem}.json").read_bytes() == before
+    reproduce(TOY, scale=0.001, base="urgency", **folders)
+    labels = 40 * (6 + 9)
+    # Labels of an earlier run say nothing about the time that is left.
+    assert bars == [(labels, labels, 0), (labels, labels, labels), None]
 
 
 def test_only_the_experiments_own_problems_can_be_chosen():

@@ -15,7 +15,7 @@ from torchrl import logger as torchrl_logger
 from torchrl_pomdp.envs import BeliefEnv, Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import write_atomically, write_json
-from torchrl_pomdp.modules import GreedyRepair, Policy
+from torchrl_pomdp.modules import GreedyRepair, NeverRepairCost, Policy
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import Result, cost_figure, table, trajectory_figure
@@ -169,6 +169,7 @@ def _evaluate(command: Evaluate) -> None:
             problem.start,
             num_states=command.states,
             seed=command.seed,
+            terminal_cost=NeverRepairCost(problem.model),
             progress=True,
             name=f"evaluate {name}",
         )

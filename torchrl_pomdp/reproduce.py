@@ -188,10 +188,15 @@ def reproduce(
     results: dict[str, dict[str, Comparison]] = {}
     iterations: dict[str, list[dict[str, Any]]] = {}
     total = sum(run.config.iterations * _iteration_labels(run) for run in planned.values())
-    with tqdm(total=total, unit="label", desc=experiment.name, disable=not progress) as bar:
+    # An average rate over the whole run, since labelling and training take turns.
+    with tqdm(total=total, unit="label", desc=experiment.name, smoothing=0, disable=not progress) as bar:
         for name, run in planned.items():
             results[name] = run.carry_out(
-                runs / name, device=device, progress=progress, report=partial(_follow, report, bar, name, run)
+                runs / name,
+                device=device,
+                progress=progress,
+                report=partial(report, name),
+                on_labels=partial(_advance, bar),
             )
             iterations[name] = json.loads((runs / name / "iterations.json").read_text())
     title = f"{experiment.name}-{settings}-{base}-scale{scale:g}-seed{seed}"
@@ -300,18 +305,11 @@ def _iteration_labels(run: TrainingRun) -> int:
     return parts * run.config.samples_per_part + values
 
 
-def _follow(
-    report: Callable[[str, str, Comparison], None],
-    bar: tqdm,
-    name: str,
-    run: TrainingRun,
-    policy: str,
-    comparison: Comparison,
-) -> None:
-    """Report a comparison, and count the labels of the iteration that it ends."""
-    if _is_iteration(policy, run):
-        bar.update(_iteration_labels(run))
-    report(name, policy, comparison)
+def _advance(bar: tqdm, labels: int, restored: bool) -> None:
+    """Count labelled states; those of an interrupted run took no time now and say nothing about the rate."""
+    if restored and not bar.disable:
+        bar.initial += labels
+    bar.update(labels)
 
 
 def _draw(

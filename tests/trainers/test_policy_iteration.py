@@ -287,8 +287,13 @@ def test_labels_of_an_interrupted_run_are_not_made_again(line3, tmp_path, monkey
     with pytest.raises(Killed):
         run(line3, folder=tmp_path / "run")
     calls[:] = [0, 0, 0]
-    run(line3, folder=tmp_path / "run")
+    told = []
+    run(line3, folder=tmp_path / "run", on_labels=lambda *labels: told.append(labels))
     assert len(calls) - 3 == 4, "two of six parts were labelled before"
+    assert told == [(200, True)] * 2 + [(200, False)] * 4
+    told.clear()
+    run(line3, folder=tmp_path / "run", on_labels=lambda *labels: told.append(labels))
+    assert told == [(600, True)] * 2
 
 
 def test_the_algorithms_refuse_partitions_that_do_not_fit(line3):

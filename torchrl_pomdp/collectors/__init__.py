@@ -1,6 +1,6 @@
 """Collectors of labelled feature states (paper, Section IV)."""
 
-from torchrl_pomdp.collectors.labels import LabelCollector
+from torchrl_pomdp.collectors.labels import LabelCollector, OnLabels
 from torchrl_pomdp.collectors.memory import StateMemory
 from torchrl_pomdp.collectors.policy_evaluation import PolicyEvaluation
 from torchrl_pomdp.collectors.rollout_improvement import RolloutImprovement
@@ -8,6 +8,7 @@ from torchrl_pomdp.collectors.states import PartSampler, StateSampler, training_
 
 __all__ = [
     "LabelCollector",
+    "OnLabels",
     "PartSampler",
     "PolicyEvaluation",
     "RolloutImprovement",

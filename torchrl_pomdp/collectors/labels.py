@@ -20,7 +20,10 @@ from torchrl_pomdp.envs.belief import BeliefEnv
 from torchrl_pomdp.files import load_tensors, save_tensors
 from torchrl_pomdp.modules.rollout import Policy
 
-__all__ = ["LabelCollector"]
+__all__ = ["LabelCollector", "OnLabels"]
+
+OnLabels = Callable[[int, bool], None]
+"""Called with a number of labelled states, and whether an interrupted run had labelled them."""
 
 # States that are drawn, labelled and kept at once; the data do not depend on it. Many, because a rollout is slow at its end,
 # when few trajectories are left.
@@ -52,6 +55,7 @@ class LabelCollector(Collector):
             again. It must belong to this run alone. None keeps nothing.
         progress: whether to show a progress bar with the labelling rate.
         name: what the progress bar calls the work.
+        on_labels: called after every block with its number of states and whether they were read from the cache.
         kwargs: further arguments of ``torchrl.collectors.Collector``.
 
     Attributes:
@@ -76,6 +80,7 @@ class LabelCollector(Collector):
         cache: Path | None = None,
         progress: bool = False,
         name: str = "label",
+        on_labels: OnLabels | None = None,
         **kwargs: Any,
     ) -> None:
         if num_workers < 1:
@@ -95,6 +100,7 @@ class LabelCollector(Collector):
         if not isinstance(self.env, BeliefEnv):
             raise TypeError(f"create_env_fn must give a BeliefEnv, got {type(self.env).__name__}")
         self.states, self.num_workers, self.cache, self.progress, self.name = states, num_workers, cache, progress, name
+        self.on_labels = on_labels
         self.labeller = label(self.env.model, self.policy)
         self._batches, self.simulated_steps, self.seconds = 0, 0, 0.0
 
@@ -119,17 +125,22 @@ class LabelCollector(Collector):
             content = load_tensors(path, self.env.device)
             self.simulated_steps += content["simulated_steps"]
             self.seconds += content["seconds"]
-            bar.update(numbers.numel())
+            self._advance(bar, numbers.numel(), cached=True)
             return TensorDict(content["states"], numbers.shape, device=self.env.device)
         before, begin = self.labeller.simulated_steps, time.perf_counter()
         block = self.labeller(self.env.model.with_features(self.states(numbers)))
         steps, seconds = self.labeller.simulated_steps - before, time.perf_counter() - begin
         self.simulated_steps += steps
         self.seconds += seconds
-        bar.update(numbers.numel())
+        self._advance(bar, numbers.numel(), cached=False)
         if path is not None:
             save_tensors(path, {"states": block.to_dict(), "simulated_steps": steps, "seconds": seconds})
         return block
+
+    def _advance(self, bar: tqdm, states: int, *, cached: bool) -> None:
+        bar.update(states)
+        if self.on_labels is not None:
+            self.on_labels(states, cached)
 
     def state_dict(self) -> dict[str, Any]:
         """State of the base policy and the number of batches made."""

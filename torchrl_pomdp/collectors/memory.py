@@ -56,9 +56,12 @@ class StateMemory:
         parts = 1 if model.partition is None else model.partition.num_parts
         # For each part the states (core entries) and their priorities, ascending.
         self._kept: list[tuple[TensorDictBase, Tensor] | None] = [None] * parts
+        # Retained states that are not merged with those yet.
+        self._pending: list[TensorDictBase] = []
 
     def count(self, part: int) -> int:
         """Number of states of a part."""
+        self._merge()
         kept = self._kept[part]
         return 0 if kept is None else kept[1].numel()
 
@@ -85,12 +88,11 @@ class StateMemory:
         if max_steps < 1:
             raise ValueError(f"max_steps must be at least 1, got {max_steps}")
         for block in keys.split(_BLOCK):
-            visited: Any = torch.cat([*self._walk(policy, start, block, exploration, max_steps)], 0)
-            self._merge(visited)
+            self._add(torch.cat([*self._walk(policy, start, block, exploration, max_steps)], 0))
 
     def extend(self, y: TensorDictBase) -> None:
         """Remember some of the feature states ``y`` ``[N]``."""
-        self._merge(self._retained(self.model.with_features(y, ("partition",))))
+        self._add(self._retained(self.model.with_features(y, ("partition",))))
 
     def generator(self, part: int) -> StateGenerator:
         """Generator of the states of a part that are kept now, all equally likely.
@@ -98,6 +100,7 @@ class StateMemory:
         Raises:
             ValueError: if there are none.
         """
+        self._merge()
         kept = self._kept[part]
         if kept is None:
             raise ValueError(f"the memory holds no state of part {part}")
@@ -138,8 +141,19 @@ class StateMemory:
         rows = (uniform(priority, 0) < self.retain).nonzero().squeeze(-1)
         return take_rows(entries, rows).update({"priority": priority[rows], "part": part[rows]})
 
-    def _merge(self, y: TensorDictBase) -> None:
-        """Keep, of what is kept and of ``y``, the states of lowest priority; equal states once."""
+    def _add(self, y: Any) -> None:
+        """Remember ``y``; merge once more is pending than kept, so that what is kept is not copied at every call."""
+        self._pending.append(y)
+        kept = sum(priority.numel() for _, priority in filter(None, self._kept))
+        if sum(pending.batch_size[0] for pending in self._pending) > kept:
+            self._merge()
+
+    def _merge(self) -> None:
+        """Keep, of what is kept and what is pending, the states of lowest priority; equal states once."""
+        if not self._pending:
+            return
+        y: Any = torch.cat(self._pending, 0)
+        self._pending = []
         for part, kept in enumerate(self._kept):
             rows = (y.get("part") == part).nonzero().squeeze(-1)
             if rows.numel() == 0:

@@ -24,7 +24,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.record.loggers import Logger
 
-from torchrl_pomdp.collectors import PartSampler, PolicyEvaluation, RolloutImprovement, StateMemory, training_states
+from torchrl_pomdp.collectors import OnLabels, PartSampler, PolicyEvaluation, RolloutImprovement, StateMemory, training_states
 from torchrl_pomdp.envs.belief import BeliefEnv
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.presets import Problem
@@ -173,6 +173,7 @@ class PolicyIteration:
         folder: where the run is kept; None keeps nothing.
         logger: TorchRL logger of losses; None logs nothing.
         progress: whether to show progress bars with rates.
+        on_labels: called as states are labelled, with their number and whether an interrupted run had labelled them.
 
     Raises:
         ValueError: if the problem's model has no partition or the plan is empty.
@@ -198,12 +199,14 @@ class PolicyIteration:
         folder: Path | None = None,
         logger: Logger | None = None,
         progress: bool = False,
+        on_labels: OnLabels | None = None,
     ) -> None:
         self.partition = _partition(problem)
         if not plan:
             raise ValueError("plan is empty: an iteration needs at least one step")
         self.problem, self.config, self.base_policy, self.plan = problem, config, base_policy, tuple(plan)
         self.folder, self.logger, self.progress = folder, logger, progress
+        self.on_labels = on_labels
         self.best: TensorDictModuleBase = base_policy
         self.memory = StateMemory(problem.model, config.memory_capacity, seed=self._seed(0, "visits"))
         self._scale = NeverRepairCost(problem.model)
@@ -260,7 +263,10 @@ class PolicyIteration:
         content = load_tensors(self.folder / f"{name}.pt", self.problem.model.device)
         for part, network in networks.items():
             network.load_state_dict(content["networks"][str(part)])
-        return {key: PartRecord(**record) for key, record in json.loads(content["records"]).items()}
+        records = {key: PartRecord(**record) for key, record in json.loads(content["records"]).items()}
+        if self.on_labels is not None:
+            self.on_labels(sum(record.samples for record in records.values()), True)
+        return records
 
     def _train_step(
         self, step: Step, networks: dict[int, LocalNetwork], local: list[Any], values: list[Any], number: int, name: str
@@ -329,6 +335,7 @@ class PolicyIteration:
             "cache": cache / str(part) if cache is not None else None,
             "progress": self.progress,
             "name": f"label {type(step).__name__.lower()} part {part}",
+            "on_labels": self.on_labels,
         }
         env = BeliefEnv(problem.model, problem.start)
         if isinstance(step, Evaluate):

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.record import CSVLogger
 
+from torchrl_pomdp.collectors import OnLabels
 from torchrl_pomdp.envs import Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import load_tensors, save_tensors, write_json
@@ -81,6 +82,7 @@ class TrainingRun:
         device: torch.device | str = "cpu",
         progress: bool = False,
         report: Report = lambda name, comparison: None,
+        on_labels: OnLabels | None = None,
     ) -> dict[str, Comparison]:
         """Train and evaluate, or go on where an interrupted run with the same numbers stopped.
 
@@ -91,6 +93,7 @@ class TrainingRun:
             device: where to compute.
             progress: whether to show progress bars.
             report: called with the name of a policy and its comparison with greedy as soon as it is known.
+            on_labels: see :class:`PolicyIteration`.
 
         Returns:
             comparisons with greedy by policy, in the order of the evaluations; online rollout on fewer states.
@@ -100,7 +103,7 @@ class TrainingRun:
         """
         problem = self.make_problem(device)
         open_run_folder(folder, asdict(self))
-        return _Execution(self, problem, folder, progress, report).carry_out()
+        return _Execution(self, problem, folder, progress, report, on_labels).carry_out()
 
 
 @dataclass
@@ -110,6 +113,7 @@ class _Execution:
     folder: Path
     progress: bool
     report: Report
+    on_labels: OnLabels | None
     results: dict[str, Comparison] = field(default_factory=dict)
 
     def carry_out(self) -> dict[str, Comparison]:
@@ -122,7 +126,13 @@ class _Execution:
         self._compare(f"R-NT of {run.base}", r_nt(self.problem, base, **online), run.states)
         logger = CSVLogger("log", log_dir=str(self.folder))
         training = ALGORITHMS[run.algorithm](
-            self.problem, config, base, folder=self.folder, logger=logger, progress=self.progress
+            self.problem,
+            config,
+            base,
+            folder=self.folder,
+            logger=logger,
+            progress=self.progress,
+            on_labels=self.on_labels,
         )
         best: str = run.base
         summaries = []
