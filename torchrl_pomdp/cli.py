@@ -15,8 +15,8 @@ from torchrl import logger as torchrl_logger
 from torchrl_pomdp.envs import BeliefEnv, Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import write_atomically, write_json
-from torchrl_pomdp.modules import GreedyRepair, NeverRepairCost, Policy
-from torchrl_pomdp.noise import seed_keys
+from torchrl_pomdp.modules import NeverRepairCost, Policy
+from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import Result, cost_figure, table, trajectory_figure
 from torchrl_pomdp.reproduce import EXPERIMENTS, reproduce
@@ -158,7 +158,7 @@ def _tell(name: str, comparison: Comparison) -> None:
 
 def _evaluate(command: Evaluate) -> None:
     problem, policy, name = _named_policy(command)
-    policies: dict[str, Policy] = {"greedy": GreedyRepair(problem.model)}
+    policies: dict[str, Policy] = {base: make(problem.model) for base, make in BASE_POLICIES.items()}
     if command.online:
         name, policy = f"{name} + R-NT", r_nt(problem, policy, trajectories=command.trajectories)
     policies.setdefault(name, policy)
@@ -209,7 +209,7 @@ def _reproduce(command: Reproduce) -> None:
 def _save_trajectory(problem: Problem, policy: Policy, path: Path) -> None:
     """Draw the trajectory of ``policy`` from the first start state of the evaluations."""
     env = BeliefEnv(problem.model, problem.start, seed=EVALUATION_SEED)
-    y = env.reset(problem.start(seed_keys(EVALUATION_SEED, torch.tensor(0))), set_state=True)
+    y = env.reset(problem.start(fold(seed_keys(EVALUATION_SEED, torch.tensor(0)), 0)), set_state=True)
     with torch.no_grad():
         trajectory = env.rollout(200, policy, tensordict=y, auto_reset=False)
     figure = trajectory_figure(problem.model, trajectory, f"{problem.name}: one trajectory of the best policy")

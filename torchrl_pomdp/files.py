@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-__all__ = ["load_tensors", "save_tensors", "write_atomically", "write_json"]
+__all__ = ["claim", "load_tensors", "save_tensors", "write_atomically", "write_json"]
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
@@ -39,6 +39,34 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
 def write_json(path: Path, content: Any) -> None:
     """Write ``content`` as JSON, atomically."""
     write_atomically(path, lambda temporary: temporary.write_text(json.dumps(content, indent=2) + "\n"))
+
+
+def claim(path: Path, identity: dict[str, Any]) -> None:
+    """Write down whose folder it is, or make sure that it is still the same one's.
+
+    Args:
+        path: the record, a JSON file.
+        identity: all that decides the results of what is kept beside it, as JSON.
+
+    Raises:
+        ValueError: if the record says otherwise; it is left as it is.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     claim(Path(folder) / "config.json", {"seed": 0})
+        ...     claim(Path(folder) / "config.json", {"seed": 0})
+        ...     sorted(path.name for path in Path(folder).iterdir())
+        ['config.json']
+    """
+    if not path.is_file():
+        write_json(path, identity)
+        return
+    found, given = json.loads(path.read_text()), json.loads(json.dumps(identity))
+    differing = sorted(key for key in {*found, *given} if found.get(key) != given.get(key))
+    if differing:
+        what = ", ".join(differing)
+        raise ValueError(f"run folder {path.parent} holds another run, which differs in {what}: name another folder")
 
 
 def save_tensors(path: Path, content: Any) -> None:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_pomdp.envs.repair import REPAIR, RepairModel
-from torchrl_pomdp.evaluation import Comparison, Estimate
+from torchrl_pomdp.evaluation import Comparison, Estimate, compare
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,8 +21,11 @@ __all__ = [
     "Result",
     "cost_figure",
     "effort",
+    "effort_table",
     "interval_text",
     "iteration_figure",
+    "paired_ratios",
+    "paired_table",
     "table",
     "time_figure",
     "trajectory_figure",
@@ -119,14 +123,15 @@ class Effort:
 
     Attributes:
         labels: labelled states.
-        steps_per_label: belief steps behind a label of the last step of each iteration, that of the startgame.
+        steps_per_label: belief steps behind a label of the last step of each iteration, that of the startgame; None where an
+            iteration has one step alone.
         label_seconds: time of labelling.
         train_seconds: time of optimisation.
         parallel_seconds: both together, had every part a processor of its own: the longest part of every step counts.
     """
 
     labels: int
-    steps_per_label: float
+    steps_per_label: float | None
     label_seconds: float
     train_seconds: float
     parallel_seconds: float
@@ -137,9 +142,9 @@ def effort(iterations: Sequence[Mapping[str, Any]]) -> Effort:
 
     Examples:
         >>> record = {"samples": 10, "simulated_steps": 400, "label_seconds": 2.0, "train_seconds": 1.0}
-        >>> parts = {"iteration-1/1-improve-part-0": record, "iteration-1/1-improve-part-1": record}
+        >>> parts = {"iteration-1/1-improve-part-1": record, "iteration-1/2-improve-part-0": record}
         >>> effort([{"parts": parts}])
-        Effort(labels=20, steps_per_label=40.0, label_seconds=4.0, train_seconds=2.0, parallel_seconds=3.0)
+        Effort(labels=20, steps_per_label=40.0, label_seconds=4.0, train_seconds=2.0, parallel_seconds=6.0)
     """
     steps: dict[str, list[Mapping[str, Any]]] = {}
     last = []
@@ -151,12 +156,93 @@ def effort(iterations: Sequence[Mapping[str, Any]]) -> Effort:
     records = [record for found in steps.values() for record in found]
     return Effort(
         labels=sum(record["samples"] for record in records),
-        steps_per_label=sum(record["simulated_steps"] for record in last) / sum(record["samples"] for record in last),
+        steps_per_label=None
+        if len(steps) == len(iterations)
+        else sum(record["simulated_steps"] for record in last) / sum(record["samples"] for record in last),
         label_seconds=sum(record["label_seconds"] for record in records),
         train_seconds=sum(record["train_seconds"] for record in records),
         # The parts of a step do not wait for each other, steps do.
         parallel_seconds=sum(max(r["label_seconds"] + r["train_seconds"] for r in found) for found in steps.values()),
     )
+
+
+def paired_ratios(costs: dict[str, Tensor]) -> dict[str, dict[str, Estimate]]:
+    """Ratios of what was trained, and of online rollout on top of it, to online rollout of the base policy and to each other.
+
+    Args:
+        costs: costs from the same start states under the same noise, by policy.
+
+    Returns:
+        the ratios by policy and by the policy that it is divided by.
+
+    Examples:
+        >>> cost = torch.tensor([10.0, 20.0])
+        >>> found = paired_ratios({"R-NT of greedy": cost, "API 1": 0.5 * cost, "API 1 + R-NT": 0.4 * cost})
+        >>> {name: {other: round(ratio.mean, 2) for other, ratio in row.items()} for name, row in found.items()}
+        {'API 1': {'R-NT of greedy': 0.5}, 'API 1 + R-NT': {'R-NT of greedy': 0.4, 'API 1': 0.8}}
+    """
+    trained = [name for name in costs if name.rpartition(" ")[2].isdigit()]
+    rollout = [name for name in costs if name.startswith(("R-NT of", "R-T of"))]
+    rows = [name for name in costs if name in trained or name.endswith("+ R-NT") or name.startswith("R-T of")]
+    ratios: dict[str, dict[str, Estimate]] = {}
+    for name in rows:
+        ratios[name] = {}
+        for other in (*rollout, *trained):
+            if name != other:
+                count = min(costs[name].numel(), costs[other].numel())
+                ratios[name][other] = compare(costs[name][:count], costs[other][:count]).ratio
+    return ratios
+
+
+def paired_table(problem: str, ratios: dict[str, dict[str, Estimate]]) -> str:
+    """Markdown table of :func:`paired_ratios` to online rollout and to each algorithm's last iteration.
+
+    Examples:
+        >>> ratio = Estimate(mean=0.5, standard_error=0.0, count=2)
+        >>> print(paired_table("line3", {"pAPI-NT 1": {"R-NT of greedy": ratio}}))
+        | line3: ratio to | R-NT of greedy |
+        |---|---|
+        | pAPI-NT 1 | 0.5000 (0.5000 … 0.5000) |
+    """
+    columns = {other: None for row in ratios.values() for other in row}
+    last = {name.rpartition(" ")[0]: name for name in columns if name.rpartition(" ")[2].isdigit()}
+    shown = [name for name in columns if name in last.values() or not name.rpartition(" ")[2].isdigit()]
+    lines = [f"| {problem}: ratio to | {' | '.join(shown)} |", f"|---|{'---|' * len(shown)}"]
+    for name, row in ratios.items():
+        cells = [_ratio_text(row[other]) if other in row else "" for other in shown]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _ratio_text(ratio: Estimate) -> str:
+    low, high = ratio.interval
+    return f"{ratio.mean:.4f} ({low:.4f} … {high:.4f})"
+
+
+def effort_table(runs: dict[str, list[dict[str, Any]]]) -> str:
+    """Markdown table of what training took, for the iterations of runs by name.
+
+    Examples:
+        >>> record = {"samples": 10, "simulated_steps": 400, "label_seconds": 2.0, "train_seconds": 1.0}
+        >>> parts = {"iteration-1/1-improve-part-1": record, "iteration-1/2-improve-part-0": record}
+        >>> print(effort_table({"line3": [{"parts": parts}]}))
+        | run | labels | belief steps per startgame label | labelling | training | a processor for each part | speed-up |
+        |---|---|---|---|---|---|---|
+        | line3 | 20 | 40 | 4 s | 2 s | 6 s | 1.0 |
+    """
+    lines = [
+        "| run | labels | belief steps per startgame label | labelling | training | a processor for each part | speed-up |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, iterations in runs.items():
+        e = effort(iterations)
+        speed_up = (e.label_seconds + e.train_seconds) / e.parallel_seconds
+        steps = "" if e.steps_per_label is None else f"{e.steps_per_label:.0f}"
+        lines.append(
+            f"| {name} | {e.labels} | {steps} | {e.label_seconds:.0f} s | {e.train_seconds:.0f} s | "
+            f"{e.parallel_seconds:.0f} s | {speed_up:.1f} |"
+        )
+    return "\n".join(lines)
 
 
 def time_figure(runs: dict[str, list[dict[str, Any]]]) -> Figure:

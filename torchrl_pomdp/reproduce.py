@@ -10,12 +10,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
-from torchrl_pomdp.evaluation import Comparison
+from torchrl_pomdp.evaluation import Comparison, Estimate
 from torchrl_pomdp.files import write_atomically, write_json
 from torchrl_pomdp.provenance import provenance
-from torchrl_pomdp.report import Result, cost_figure, effort, interval_text, iteration_figure, time_figure
+from torchrl_pomdp.report import (
+    Result,
+    cost_figure,
+    effort_table,
+    interval_text,
+    iteration_figure,
+    paired_ratios,
+    paired_table,
+    time_figure,
+)
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.run import TrainingRun
 
@@ -187,6 +197,7 @@ def reproduce(
     planned = plan(experiment, settings, base, scale, seed, problems)
     results: dict[str, dict[str, Comparison]] = {}
     iterations: dict[str, list[dict[str, Any]]] = {}
+    costs: dict[str, dict[str, Tensor]] = {}
     total = sum(run.config.iterations * _iteration_labels(run) for run in planned.values())
     # An average rate over the whole run, since labelling and training take turns.
     with tqdm(total=total, unit="label", desc=experiment.name, smoothing=0, disable=not progress) as bar:
@@ -199,11 +210,13 @@ def reproduce(
                 on_labels=partial(_advance, bar),
             )
             iterations[name] = json.loads((runs / name / "iterations.json").read_text())
+            costs.setdefault(run.problem, {}).update(run.costs(runs / name, results[name]))
     title = f"{experiment.name}-{settings}-{base}-scale{scale:g}-seed{seed}"
     if problems:
         title = f"{title}-{'-'.join(problems)}"
     about = {"experiment": experiment.name, "settings": settings, "base": base, "scale": scale, "seed": seed}
-    return _write(out, title, about, planned, results, iterations)
+    paired = {problem: paired_ratios(found) for problem, found in costs.items()}
+    return _write(out, title, about, planned, results, iterations, paired)
 
 
 def _write(
@@ -213,6 +226,7 @@ def _write(
     planned: dict[str, TrainingRun],
     results: dict[str, dict[str, Comparison]],
     iterations: dict[str, list[dict[str, Any]]],
+    paired: dict[str, dict[str, dict[str, Estimate]]],
 ) -> str:
     """Write numbers, tables and figures; returns the tables."""
     content = {
@@ -220,10 +234,14 @@ def _write(
         "provenance": provenance(),
         "runs": {name: asdict(run) for name, run in planned.items()},
         "results": {name: {p: asdict(c) for p, c in found.items()} for name, found in results.items()},
+        "paired": {
+            problem: {p: {r: asdict(e) for r, e in row.items()} for p, row in rows.items()} for problem, rows in paired.items()
+        },
         "iterations": iterations,
     }
     write_json(out / f"{title}.json", content)
     text = comparison_table({name: (run.problem, results[name]) for name, run in planned.items()})
+    text += "".join(f"\n\n{paired_table(problem, rows)}" for problem, rows in paired.items())
     text += f"\n\n{effort_table({f'{run.problem}, {run.algorithm}': iterations[name] for name, run in planned.items()})}"
     write_atomically(out / f"{title}.md", lambda path: path.write_text(text + "\n"))
     _draw(out, title, planned, results, iterations)
@@ -268,30 +286,6 @@ def _over_optimum(problem: str, comparison: Comparison) -> str:
         return ""
     low, high = (100 * (cost / OPTIMA[problem] - 1) for cost in comparison.cost.interval)
     return f"{(low + high) / 2:.2f} % ± {(high - low) / 2:.2f}"
-
-
-def effort_table(runs: dict[str, list[dict[str, Any]]]) -> str:
-    """Markdown table of what training took, for the iterations of runs by name.
-
-    Examples:
-        >>> record = {"samples": 10, "simulated_steps": 400, "label_seconds": 2.0, "train_seconds": 1.0}
-        >>> print(effort_table({"line3": [{"parts": {"iteration-1/1-improve-part-0": record}}]}))
-        | run | labels | belief steps per startgame label | labelling | training | a processor for each part | speed-up |
-        |---|---|---|---|---|---|---|
-        | line3 | 10 | 40 | 2 s | 1 s | 3 s | 1.0 |
-    """
-    lines = [
-        "| run | labels | belief steps per startgame label | labelling | training | a processor for each part | speed-up |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name, iterations in runs.items():
-        e = effort(iterations)
-        speed_up = (e.label_seconds + e.train_seconds) / e.parallel_seconds
-        lines.append(
-            f"| {name} | {e.labels} | {e.steps_per_label:.0f} | {e.label_seconds:.0f} s | {e.train_seconds:.0f} s | "
-            f"{e.parallel_seconds:.0f} s | {speed_up:.1f} |"
-        )
-    return "\n".join(lines)
 
 
 def _is_iteration(policy: str, run: TrainingRun) -> bool:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_pomdp.collectors import StateMemory, training_states
-from torchrl_pomdp.envs import BeliefEnv, FixedBelief, tiger
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief, make_problem, tiger
 from torchrl_pomdp.modules import GreedyRepair
 
 
@@ -77,6 +77,16 @@ def test_models_without_a_partition_have_one_part():
     memory.visit(lambda y: y.set("action", torch.zeros(y.batch_size, dtype=torch.int64)), FixedBelief(torch.tensor([0.5, 0.5])),
                  torch.arange(4), max_steps=5)  # fmt: skip
     assert 1 < memory.count(0) <= 2 * 5 + 1
+
+
+def test_training_states_of_a_single_part_are_of_all_six_and_of_the_memory():
+    problem, six = make_problem("linear20", partitioned=False), make_problem("linear20").model.partition
+    memory = visit(problem, torch.arange(200))
+    visited = held(memory, 0)
+    y = training_states(problem, memory, 0, visited_share=0.7)(torch.arange(4000))
+    random = torch.tensor([f not in visited for f in problem.model.fingerprint(y).tolist()])
+    assert abs(random.float().mean() - 0.3) < 4 * (0.21 / 4000) ** 0.5
+    assert (six(y[random]).bincount(minlength=6) / int(random.sum()) - 1 / 6).abs().max() < 0.05
 
 
 def test_parts_that_nobody_visits_are_filled_with_random_states(linear20):

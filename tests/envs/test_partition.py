@@ -85,12 +85,33 @@ def test_calibrated_start_has_the_distribution_it_says(linear20):
     assert ((here == 0) | (here == 1)).all()
 
 
+class FixedState:
+    """Everything is intact: a state that no other generator draws."""
+
+    def __init__(self, problem):
+        self.y = problem.start(torch.zeros(1, dtype=torch.int64))
+        self.y["belief"] = torch.eye(5)[0].expand(1, 20, 5).clone()
+
+    def __call__(self, keys):
+        return self.y[torch.zeros_like(keys)]
+
+
 def test_sampler_numbers_states_evenly_over_parts(linear20):
     mixture = Mixture([linear20.training[0], linear20.start], [1.0, 0.0])
     sampler = PartSampler({0: mixture, 5: linear20.training[5]}, seed=4)
     whole = sampler(torch.arange(40))
     assert linear20.model.partition(whole).tolist() == [0, 5] * 20
     assert torch.equal(sampler(torch.arange(13, 29))["belief"], whole["belief"][13:29])
+
+
+def test_a_mixture_within_a_mixture_keeps_its_shares(linear20):
+    """The inner choice must not follow from the outer one."""
+    inner = Mixture(linear20.training, [1.0, 1.0, 2.0, 1.0, 1.0, 2.0])
+    y = Mixture([inner, FixedState(linear20)], [0.5, 0.5])(torch.arange(8000))
+    known = (y["belief"][..., 0] == 1).all(-1)
+    assert abs(known.float().mean() - 0.5) < 4 * (0.25 / 8000) ** 0.5
+    shares = linear20.model.partition(y[~known]).bincount(minlength=6) / int((~known).sum())
+    assert (shares - torch.tensor([1.0, 1.0, 2.0, 1.0, 1.0, 2.0]) / 8).abs().max() < 0.02
 
 
 def test_bad_arguments_are_refused(linear20):

@@ -5,7 +5,17 @@ import torch
 from _oracles import random_states, small_model
 
 from torchrl_pomdp.envs import grid, line, tiger
-from torchrl_pomdp.modules import FlatEncoder, GreedyRepair, PartitionedPolicy, PolicyNetwork, RelativeEncoder
+from torchrl_pomdp.modules import (
+    FlatEncoder,
+    GreedyRepair,
+    NeverRepairCost,
+    PartitionedPolicy,
+    PartitionedValue,
+    PolicyNetwork,
+    RelativeEncoder,
+    SteadyStateCost,
+    ValueNetwork,
+)
 
 
 def network(model, seed=0, encoder=FlatEncoder):
@@ -89,6 +99,18 @@ def test_router_gives_every_row_its_own_parts_answer(linear20):
         assert u[row] == alone[0]
     assert torch.equal(router(y.reshape(5, 6).clone())["action"], u.view(5, 6))
     assert router.out_keys == ["action"], "the greedy policy has no logits"
+
+
+def test_values_of_different_scales_are_not_mixed_up(linear20):
+    model, encoder = linear20.model, RelativeEncoder(linear20.model)
+    generator = torch.Generator().manual_seed(0)
+    scales = [NeverRepairCost(model), SteadyStateCost(model)]
+    values = [ValueNetwork(encoder, scales[part % 2], (16,), generator=generator) for part in range(6)]
+    y = model.with_features(torch.cat([states(torch.arange(20)) for states in linear20.training]))
+    together = PartitionedValue(values)(y.copy())["state_value"]
+    for part, value in enumerate(values):
+        rows = y["partition"] == part
+        assert torch.equal(together[rows], value(y[rows])["state_value"])
 
 
 def test_gradients_reach_the_networks_of_the_rows_parts_alone(linear20):

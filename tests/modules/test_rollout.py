@@ -165,7 +165,7 @@ def test_costs_do_not_depend_on_the_batch(linear20, size):
 def test_bad_numbers_are_refused(line3):
     with pytest.raises(ValueError, match="max_steps"):
         TruncatedRollout(line3.model, GreedyRepair(line3.model), max_steps=0)
-    with pytest.raises(ValueError, match=r"max_steps=10 needs a terminal_cost, got None: what is cut weighs 0.9 of a stage"):
+    with pytest.raises(ValueError, match=r"max_steps=10 needs a terminal_cost, got None: the first stage cut weighs 0.9"):
         TruncatedRollout(line3.model, GreedyRepair(line3.model), max_steps=10)
     with pytest.raises(ValueError, match="damage_threshold"):
         GreedyRepair(line3.model, damage_threshold=1.0)

@@ -15,6 +15,7 @@ from torchrl_pomdp.modules import (
     GreedyRepair,
     NeverRepairCost,
     OnEntering,
+    PartitionedPolicy,
     PolicyCost,
     PolicyNetwork,
     RolloutPolicy,
@@ -39,7 +40,7 @@ from torchrl_pomdp.trainers import (
     train_part,
 )
 from torchrl_pomdp.trainers import policy_iteration as module
-from torchrl_pomdp.trainers.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from torchrl_pomdp.trainers.checkpoint import Checkpoint, load_checkpoint, open_run_folder, save_checkpoint
 
 TINY = PolicyIterationConfig(
     iterations=1,
@@ -97,11 +98,12 @@ def collected(monkeypatch, problem, recipe):
     seen = []
     original = PolicyIteration._collector
 
-    def record(self, step, policy, value, number, cache, part):
+    def record(self, index, policy, value, number, cache, part):
+        step = self.plan[index]
         local = [type(p).__name__ for p in policy.policies]
         values = [type(v).__name__ for v in value.values]
         seen.append((type(step).__name__, part, local, values, step.truncation))
-        return original(self, step, policy, value, number, cache, part)
+        return original(self, index, policy, value, number, cache, part)
 
     monkeypatch.setattr(PolicyIteration, "_collector", record)
     run(problem, recipe=recipe)
@@ -212,6 +214,50 @@ def test_a_worse_iteration_is_rejected_and_the_best_policy_stays(line3):
     assert all("not lower with confidence" in iteration.reason for iteration in iterations)
     assert all(iteration.comparison.ratio.mean > 1 for iteration in iterations)
     assert not torch.equal(weights(iterations[0].policy), weights(iterations[1].policy)), "it tries other states"
+
+
+def test_values_are_the_best_policys(line3, monkeypatch):
+    """What a rejected iteration has learnt is no terminal cost of the next one."""
+    seen = []
+    original = PolicyIteration._collector
+
+    def record(self, index, policy, value, number, cache, part):
+        seen.append((number, index, {type(v).__name__ for v in value.values}))
+        return original(self, index, policy, value, number, cache, part)
+
+    monkeypatch.setattr(PolicyIteration, "_collector", record)
+    config = replace(TINY, iterations=2, samples_per_part=20, value_samples=20, epochs=1)
+    algorithm = PolicyIteration(line3, config, UrgencyRepair(line3.model), [Improve((3,)), Evaluate((3,))])
+    assert not any(iteration.accepted for iteration in algorithm)
+    assert seen == [(1, 0, {NEVER}), (1, 1, {NEVER}), (2, 0, {NEVER}), (2, 1, {NEVER})]
+
+
+def test_steps_for_the_same_part_draw_other_states_and_noise(line3):
+    algorithm = PolicyIteration(line3, TINY, GreedyRepair(line3.model), [Improve((3, 4)), Evaluate((4,)), Improve((4,))])
+    collectors = [
+        algorithm._collector(index, PartitionedPolicy([algorithm.base_policy] * 6), algorithm._scale, 1, None, 4)
+        for index in range(3)
+    ]
+    assert len({collector.labeller.seed for collector in collectors}) == 3
+    states = [set(line3.model.fingerprint(collector.states(torch.arange(50))).tolist()) for collector in collectors]
+    assert all(len(one & other) < 25 for one in states for other in states if one is not other)
+
+
+def test_to_iterate_again_is_to_start_anew(line3):
+    algorithm = papi_nt(line3, TINY, GreedyRepair(line3.model))
+    one, other = list(algorithm), list(algorithm)
+    assert torch.equal(weights(one[0].policy), weights(other[0].policy))
+    assert one[0].comparison == other[0].comparison
+
+
+def test_a_folder_is_of_one_run(line3, tmp_path):
+    run(line3, folder=tmp_path)
+    with pytest.raises(ValueError, match="holds another run, which differs in config: name another folder"):
+        run(line3, replace(TINY, seed=1), folder=tmp_path)
+    with pytest.raises(ValueError, match="differs in plan"):
+        run(line3, recipe=papi_t, folder=tmp_path)
+    with pytest.raises(ValueError, match="differs in base_policy"):
+        list(papi_nt(line3, TINY, UrgencyRepair(line3.model), folder=tmp_path))
 
 
 def test_states_of_every_iterations_policy_are_remembered(line3, monkeypatch):
@@ -351,7 +397,7 @@ def test_models_without_a_partition_are_refused():
         {"iterations": 0}, {"samples_per_part": 0}, {"trajectories": 0}, {"max_steps": 0}, {"batch_size": 0},
         {"visits_per_label": 0.0}, {"memory_capacity": 0}, {"value_samples": 0}, {"validation_states": 0},
         {"value_hidden": (0,)}, {"epochs": 0}, {"least_steps": 0}, {"visited_share": 1.5},
-        {"exploration": -0.1}, {"learning_rate": 0.0}, {"hidden": ()},
+        {"exploration": -0.1}, {"learning_rate": 0.0}, {"hidden": ()}, {"loss": "L2"}, {"encoder": "Flat"}, {"allocation": "all"},
     ],
 )  # fmt: skip
 def test_bad_numbers_are_named(change):
@@ -384,6 +430,24 @@ def test_checkpoints_of_trained_policies_know_which_parts_have_values(line3, tmp
     loaded = load_checkpoint(path)
     assert [type(v).__name__ for v in loaded.value.values] == [NEVER] * 3 + [VALUE] * 3
     assert torch.equal(weights(loaded.value), weights(iteration.value))
+
+
+def test_checkpoints_that_could_not_be_loaded_are_refused(line3, tmp_path):
+    greedy = PartitionedPolicy([GreedyRepair(line3.model)] * 6)
+    value, path = make_values(line3, TINY, 0), tmp_path / "policy.pt"
+    with pytest.raises(ValueError, match="must have a PolicyNetwork in every part, got GreedyRepair"):
+        save_checkpoint(path, Checkpoint(line3, TINY, "pAPI-NT", 1, greedy, value))
+    own = replace(line3, name="mine")
+    with pytest.raises(ValueError, match=r"checkpoint.problem must be one of grid5x4, .*, got 'mine'"):
+        save_checkpoint(path, Checkpoint(own, TINY, "pAPI-NT", 1, make_networks(line3, TINY, 0), value))
+    assert not path.exists()
+
+
+def test_a_kill_while_a_run_folder_is_opened_does_not_spoil_it(tmp_path):
+    (tmp_path / ".config.123.json").write_text("{")
+    assert open_run_folder(tmp_path, {"seed": 0}) == tmp_path
+    with pytest.raises(ValueError, match="differs in seed"):
+        open_run_folder(tmp_path, {"seed": 1})
 
 
 def test_damaged_and_foreign_checkpoints_are_refused(tmp_path):

@@ -90,10 +90,6 @@ class StateMemory:
         for block in keys.split(_BLOCK):
             self._add(torch.cat([*self._walk(policy, start, block, exploration, max_steps)], 0))
 
-    def extend(self, y: TensorDictBase) -> None:
-        """Remember some of the feature states ``y`` ``[N]``."""
-        self._add(self._retained(self.model.with_features(y, ("partition",))))
-
     def generator(self, part: int) -> StateGenerator:
         """Generator of the states of a part that are kept now, all equally likely.
 

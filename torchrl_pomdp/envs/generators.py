@@ -192,7 +192,8 @@ class Mixture:
     """Generator that draws each state from one of several generators.
 
     Args:
-        generators: the generators that are mixed.
+        generators: the generators that are mixed; a mixture among them is replaced by what it mixes, so that there is one
+            choice for each state.
         weights: their probabilities, nonnegative with positive sum.
 
     Raises:
@@ -208,7 +209,16 @@ class Mixture:
     def __init__(self, generators: Sequence[StateGenerator], weights: Sequence[float]) -> None:
         if len(generators) != len(weights) or not generators or min(weights) < 0 or sum(weights) <= 0:
             raise ValueError(f"weights must be {len(generators)} nonnegative numbers with positive sum, got {list(weights)}")
-        self.generators, self.weights = list(generators), torch.tensor(weights, dtype=torch.float32)
+        self.generators: list[StateGenerator] = []
+        shares: list[Tensor] = []
+        for generator, weight in zip(generators, torch.tensor(weights, dtype=torch.float32), strict=True):
+            if isinstance(generator, Mixture):
+                self.generators += generator.generators
+                shares.append(weight * generator.weights / generator.weights.sum())
+            else:
+                self.generators.append(generator)
+                shares.append(weight.unsqueeze(0))
+        self.weights: Tensor = torch.cat(shares)
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` for int64 keys ``[*B]``."""

@@ -262,10 +262,6 @@ class RepairModel(BeliefModel):
         levels = self._draw_levels([self._levels_at(planes, place) for place in location], location, noise)
         return self._successor(y, self._set_levels(planes, location, levels), location)
 
-    def degrade(self, belief: Tensor, steps: int = 1) -> Tensor:
-        """Marginals ``[..., K]`` after ``steps`` steps of the chain without repairs or observations."""
-        return belief @ torch.linalg.matrix_power(self.chain, steps)
-
     # ---- kernels on planes [L, K, N] and locations [R, N] ----------------------------------------------------------
 
     def _planes(self, y: TensorDictBase) -> Tensor:

@@ -1,7 +1,9 @@
 """Symmetries of the repair problem: what a label says of one state it says of every mirror image of that state.
 
 Reflections and rotations of a line or grid, and exchanges of robots, change neither costs nor probabilities. Every labelled
-state therefore stands for several, which is the cheapest way to more training data.
+state therefore stands for several, which is the cheapest way to more training data. The image of a label is a label by the
+image of the base policy: by the same policy if that is symmetric, as urgency is but for ties; by its mirror image, which costs
+as much over all states, if it breaks ties by number, as greedy does, or is a network.
 """
 
 from __future__ import annotations

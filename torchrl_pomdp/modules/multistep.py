@@ -15,6 +15,8 @@ __all__ = ["MultistepLookahead"]
 
 # Root states that are expanded at once.
 _BLOCK = 256
+# Stream of the drawn observations of a tree, apart from those of its trajectories, which are numbered from 0.
+_OBSERVATIONS = 1 << 32
 
 
 class MultistepLookahead(TensorDictModuleBase):
@@ -81,7 +83,9 @@ class MultistepLookahead(TensorDictModuleBase):
         model, mask = self.model, self._worthwhile(y, keys)
         state, u = mask.nonzero(as_tuple=True)
         pairs = take_rows(y, state)
-        pair, observation, weight = self._observations(model.observation_probs(pairs, u), fold(keys[state], depth))
+        pair, observation, weight = self._observations(
+            model.observation_probs(pairs, u), fold(fold(keys[state], _OBSERVATIONS), depth)
+        )
         successors = model.estimator(take_rows(pairs, pair), u[pair], observation)
         value = self._values(successors, keys[state[pair]], depth - 1)
         # [P, branches]: summed in a fixed order.

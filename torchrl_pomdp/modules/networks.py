@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -44,6 +44,11 @@ class LocalNetwork(TensorDictModuleBase):
         rows = torch.arange(flat.batch_size[0], device=flat.device)
         entries, rows = evaluate_networks([self], flat, rows, [rows.numel()])
         return tensordict.update(entries[invert(rows)].reshape(tensordict.batch_size))
+
+    @property
+    def kind(self) -> tuple[Any, ...]:
+        """What networks have in common that can be evaluated together."""
+        return type(self), self.encoder
 
     @abstractmethod
     def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
@@ -122,6 +127,11 @@ class ValueNetwork(LocalNetwork):
         self.scale = scale
         self.in_keys = self.entry_keys = list(encoder.keys)
 
+    @property
+    def kind(self) -> tuple[Any, ...]:
+        """What networks have in common that can be evaluated together: the scale, too."""
+        return *super().kind, self.scale
+
     def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
         """``"state_value"``; see the class."""
         return TensorDict({"state_value": output.squeeze(-1) * self.scale.costs(y)}, y.batch_size)
@@ -130,10 +140,10 @@ class ValueNetwork(LocalNetwork):
 def evaluate_networks(
     networks: Sequence[LocalNetwork], y: TensorDictBase, rows: Tensor, counts: Sequence[int]
 ) -> tuple[TensorDictBase, Tensor]:
-    """Entries of networks of one kind that share an encoder, each at rows of its own.
+    """Entries of networks of one kind, each at rows of its own.
 
     Args:
-        networks: the networks.
+        networks: the networks, of the same :attr:`LocalNetwork.kind`.
         y: feature states ``[N]``.
         rows: int64 ``[M]``, numbers of rows of ``y``.
         counts: the first network is evaluated at the first ``counts[0]`` of ``rows``, the second at the next, ...

@@ -19,15 +19,15 @@ __all__ = ["PartitionedPolicy", "PartitionedValue"]
 class _Partitioned(TensorDictModuleBase):
     """Routes the rows of a batch to the modules of their parts.
 
-    A module that is local to several parts is called once for all of them. Networks that share an encoder are evaluated
-    together: the batch is sorted by network and encoded once.
+    A module that is local to several parts is called once for all of them. Networks of one kind, which share an encoder, are
+    evaluated together: the batch is sorted by network and encoded once.
     """
 
     def __init__(self, members: Sequence[TensorDictModuleBase]) -> None:
         super().__init__()
         distinct = dict.fromkeys(members)
-        encoders = {member.encoder: None for member in distinct if isinstance(member, LocalNetwork)}
-        self._networks = [m for m in distinct if isinstance(m, LocalNetwork)] if len(encoders) == 1 else []
+        kinds = {member.kind for member in distinct if isinstance(member, LocalNetwork)}
+        self._networks = [m for m in distinct if isinstance(m, LocalNetwork)] if len(kinds) == 1 else []
         # Networks come last, so that their rows are neighbours once the batch is sorted.
         self._others = [member for member in distinct if member not in self._networks]
         numbers = {member: number for number, member in enumerate([*self._others, *self._networks])}

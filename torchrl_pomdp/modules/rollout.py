@@ -26,7 +26,7 @@ them as ``"state_value"`` ``[*B]`` (costs, lower is better). ``in_keys``, where 
 
 # Default of `chunk_rows`, wherever a rollout is made. No power of two: planes that lie so far apart compete for cache lines.
 CHUNK_ROWS = 16_000
-# Discount of a stage beyond which costs may be left out.
+# Discount of the first stage that is cut up to which its cost and the later ones' may be left out.
 _INSIGNIFICANT = 0.02
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
 _RENEW_FRACTION = 0.15
@@ -248,7 +248,7 @@ def _check_rest(model: BeliefModel, max_steps: int, truncation: Truncation | Non
     weight = model.discount**max_steps
     if weight > _INSIGNIFICANT:
         raise ValueError(
-            f"max_steps={max_steps} needs a terminal_cost, got None: what is cut weighs {weight:.2g} of a stage, more than "
+            f"max_steps={max_steps} needs a terminal_cost, got None: the first stage cut weighs {weight:.2g}, more than "
             f"{_INSIGNIFICANT}; pass ZeroCost() to add nothing"
         )
 

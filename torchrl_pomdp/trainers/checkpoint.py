@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 
-from torchrl_pomdp.envs.presets import Problem, make_problem
-from torchrl_pomdp.files import load_tensors, save_tensors, write_json
-from torchrl_pomdp.modules import NeverRepairCost, PartitionedPolicy, PartitionedValue, ValueNetwork
+from torchrl_pomdp.envs.presets import PRESETS, Problem, make_problem
+from torchrl_pomdp.files import claim, load_tensors, save_tensors
+from torchrl_pomdp.modules import NeverRepairCost, PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.policy_iteration import make_networks, make_values
 
@@ -59,15 +59,11 @@ def open_run_folder(path: Path, identity: dict[str, Any]) -> Path:
         True
     """
     record = path / "config.json"
-    if record.is_file():
-        found = json.loads(record.read_text())
-        differing = sorted(k for k in {*found, *identity} if found.get(k) != json.loads(json.dumps(identity)).get(k))
-        if not differing:
-            return path
-        raise ValueError(f"run folder {path} holds another run, which differs in {', '.join(differing)}: name another folder")
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    # What a kill in the middle of writing the record leaves has its name after a dot.
+    in_use = path.exists() and (not path.is_dir() or any(not file.name.startswith(".config.") for file in path.iterdir()))
+    if in_use and not record.is_file():
         raise ValueError(f"run folder {path} is in use: name a folder that is empty, does not exist, or holds this run")
-    write_json(record, identity)
+    claim(record, identity)
     return path
 
 
@@ -77,7 +73,15 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     Args:
         path: file to make or replace, atomically.
         checkpoint: the policy and its provenance; the problem must be a preset.
+
+    Raises:
+        ValueError: if the problem is no preset, or a part's policy is not a network.
     """
+    if checkpoint.problem.name not in PRESETS:
+        raise ValueError(f"checkpoint.problem must be one of {', '.join(sorted(PRESETS))}, got {checkpoint.problem.name!r}")
+    others = [type(p).__name__ for p in checkpoint.policy.policies if not isinstance(p, PolicyNetwork)]
+    if others:
+        raise ValueError(f"checkpoint.policy must have a PolicyNetwork in every part, got {others[0]}")
     about = {
         "format": _FORMAT,
         "problem": checkpoint.problem.name,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args, get_origin, get_type_hints
 
 __all__ = ["PolicyIterationConfig"]
 
@@ -105,6 +105,9 @@ class PolicyIterationConfig:
         for name in ("visits_per_label", "learning_rate"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name, hint in get_type_hints(type(self)).items():
+            if get_origin(hint) is Literal and getattr(self, name) not in get_args(hint):
+                raise ValueError(f"{name} must be one of {', '.join(get_args(hint))}, got {getattr(self, name)!r}")
         for name in ("hidden", "value_hidden"):
             sizes = getattr(self, name)
             if not sizes or min(sizes) < 1:

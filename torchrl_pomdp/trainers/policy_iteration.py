@@ -14,7 +14,7 @@ import json
 import math
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -30,7 +30,7 @@ from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.envs.symmetry import symmetries
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.files import load_tensors, save_tensors
+from torchrl_pomdp.files import claim, load_tensors, save_tensors
 from torchrl_pomdp.modules import (
     Encoder,
     FlatEncoder,
@@ -154,11 +154,11 @@ def make_values(problem: Problem, config: PolicyIterationConfig, seed: int, enco
 
 
 class PolicyIteration:
-    r"""Policy iteration from a base policy: an iterator over its iterations, and the best policy so far.
+    r"""Policy iteration from a base policy: its iterations, and the best policy so far. To iterate again is to start anew.
 
     An iteration starts from the best policy so far. Its policy is accepted if, on fixed validation states and under the same
     noise, its mean cost is lower with 95 % confidence; a rejected one is dropped, and the next iteration tries again with other
-    training states, those where the rejected one went among them.
+    training states, those where the rejected one went among them. The value networks are those of the best policy, too.
 
     With a ``folder`` every trained part and every block of labels is kept there as soon as it is there. The same iteration
     with the same folder goes on where an earlier one was interrupted, and gives the same result.
@@ -170,13 +170,14 @@ class PolicyIteration:
         plan: the steps of an iteration.
 
     Keyword Args:
-        folder: where the run is kept; None keeps nothing.
+        folder: where the run is kept, a folder of this run alone; None keeps nothing.
         logger: TorchRL logger of losses; None logs nothing.
         progress: whether to show progress bars with rates.
         on_labels: called as states are labelled, with their number and whether an interrupted run had labelled them.
 
     Raises:
-        ValueError: if the problem's model has no partition or the plan is empty.
+        ValueError: if the problem's model has no partition or the plan is empty; when iterated, if the folder holds a run with
+            another problem, configuration, plan or kind of base policy.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -207,15 +208,21 @@ class PolicyIteration:
         self.problem, self.config, self.base_policy, self.plan = problem, config, base_policy, tuple(plan)
         self.folder, self.logger, self.progress = folder, logger, progress
         self.on_labels = on_labels
-        self.best: TensorDictModuleBase = base_policy
-        self.memory = StateMemory(problem.model, config.memory_capacity, seed=self._seed(0, "visits"))
         self._scale = NeverRepairCost(problem.model)
         self._symmetries = symmetries(problem.model)[: None if config.symmetries else 1]
-        self._values: list[TensorDictModuleBase] = [self._scale] * self.partition.num_parts
         self._encoder = _shared_encoder(base_policy) or _ENCODERS[config.encoder](problem.model)
+        self._start()
+
+    def _start(self) -> None:
+        self.best: TensorDictModuleBase = self.base_policy
+        self.memory = StateMemory(self.problem.model, self.config.memory_capacity, seed=self._seed(0, "visits"))
+        self._values: list[TensorDictModuleBase] = [self._scale] * self.partition.num_parts
 
     def __iter__(self) -> Iterator[Iteration]:
         """Carry out the iterations, in order."""
+        self._start()
+        if self.folder is not None:
+            claim(self.folder / "policy-iteration.json", self._identity())
         policy = self.best
         best_costs = self._validate(policy, "base policy")
         for number in range(1, self.config.iterations + 1):
@@ -225,10 +232,15 @@ class PolicyIteration:
             costs = self._validate(policy, f"iteration {number}")
             comparison = compare(costs, best_costs)
             accepted, reason = _judge(comparison)
-            self._values = values
             if accepted:
-                self.best, best_costs = policy, costs
+                self.best, self._values, best_costs = policy, values, costs
             yield Iteration(number, policy, PartitionedValue(values).eval(), accepted, reason, comparison, records)
+
+    def _identity(self) -> dict[str, Any]:
+        """What decides the results, as JSON."""
+        plan = [[type(s).__name__, s.parts, type(s.truncation).__name__ if s.truncation else None] for s in self.plan]
+        base = type(self.base_policy).__name__
+        return {"problem": self.problem.name, "base_policy": base, "plan": plan, "config": asdict(self.config)}
 
     def _iterate(self, number: int) -> tuple[list[Any], list[Any], dict[str, PartRecord]]:
         """The local policies and values after one iteration from the best policy."""
@@ -237,21 +249,25 @@ class PolicyIteration:
         values: list[Any] = list(self._values)
         records: dict[str, PartRecord] = {}
         for index, step in enumerate(self.plan):
-            name = f"iteration-{number}/{index + 1}-{type(step).__name__.lower()}"
-            networks = {part: self._initial(step, part, local, values, number) for part in step.parts}
-            trained = self._restore(networks, name)
-            records |= trained or self._train_step(step, networks, local, values, number, name)
+            networks = {part: self._initial(index, part, local, values, number) for part in step.parts}
+            trained = self._restore(networks, self._name(number, index))
+            records |= trained or self._train_step(index, networks, local, values, number)
             for part, network in networks.items():
                 (local if isinstance(step, Improve) else values)[part] = network.eval()
         return local, values, records
 
-    def _initial(self, step: Step, part: int, local: list[Any], values: list[Any], number: int) -> LocalNetwork:
+    def _name(self, number: int, index: int) -> str:
+        """Name of a step of the plan in an iteration."""
+        return f"iteration-{number}/{index + 1}-{type(self.plan[index]).__name__.lower()}"
+
+    def _initial(self, index: int, part: int, local: list[Any], values: list[Any], number: int) -> LocalNetwork:
         """The network to train: the one that the part has, or a new one."""
+        step = self.plan[index]
         old = (local if isinstance(step, Improve) else values)[part]
         if isinstance(old, LocalNetwork):
             # What has no weights is shared; a shared encoder lets networks be evaluated together.
             return copy.deepcopy(old, {id(old.encoder): old.encoder, id(self._scale): self._scale})
-        seed = self._seed(number, "weights", part)
+        seed = self._seed(number, "weights", part, index)
         if isinstance(step, Improve):
             return cast(LocalNetwork, make_networks(self.problem, self.config, seed, self._encoder).policies[part])
         return cast(LocalNetwork, make_values(self.problem, self.config, seed, self._encoder).values[part])
@@ -269,11 +285,12 @@ class PolicyIteration:
         return records
 
     def _train_step(
-        self, step: Step, networks: dict[int, LocalNetwork], local: list[Any], values: list[Any], number: int, name: str
+        self, index: int, networks: dict[int, LocalNetwork], local: list[Any], values: list[Any], number: int
     ) -> dict[str, PartRecord]:
         """Label states of the step's parts, train their networks in place, and keep them."""
+        step, name = self.plan[index], self._name(number, index)
         cache = self.folder / f"{name}.labels" if self.folder is not None else None
-        make = partial(self._collector, step, PartitionedPolicy(local), PartitionedValue(values), number, cache)
+        make = partial(self._collector, index, PartitionedPolicy(local), PartitionedValue(values), number, cache)
         collectors = {part: make(part) for part in step.parts}
         labelled: dict[int, Any] = {part: next(iter(collector)) for part, collector in collectors.items()}
         images = self._images(labelled)
@@ -283,7 +300,7 @@ class PolicyIteration:
                 images[part],
                 ClassificationLoss(network, self.config.loss) if isinstance(step, Improve) else ValueLoss(network, self._scale),
                 self.config,
-                seed=self._seed(number, "batches", part),
+                seed=self._seed(number, "batches", part, index),
                 name=f"{name}-part-{part}",
                 logger=self.logger,
                 progress=self.progress,
@@ -311,7 +328,7 @@ class PolicyIteration:
 
     def _collector(
         self,
-        step: Step,
+        index: int,
         policy: PartitionedPolicy,
         value: PartitionedValue,
         number: int,
@@ -319,17 +336,17 @@ class PolicyIteration:
         part: int,
     ) -> RolloutImprovement | PolicyEvaluation:
         """Collector of the labelled states of a part, all in one batch."""
-        config, problem = self.config, self.problem
+        config, problem, step = self.config, self.problem, self.plan[index]
         simulation: dict[str, Any] = {
             "max_steps": config.max_steps,
             "truncation": step.truncation,
             "terminal_cost": value,
-            "seed": self._seed(number, "labels", part),
+            "seed": self._seed(number, "labels", part, index),
         }
         states = training_states(problem, self.memory, part, visited_share=config.visited_share)
         samples = config.samples_per_part if isinstance(step, Improve) else config.value_samples
         options: dict[str, Any] = {
-            "states": PartSampler({part: states}, self._seed(number, "states", part)),
+            "states": PartSampler({part: states}, self._seed(number, "states", part, index)),
             "frames_per_batch": samples,
             "total_frames": samples,
             "cache": cache / str(part) if cache is not None else None,
@@ -364,9 +381,11 @@ class PolicyIteration:
             name=f"validate {name}",
         )
 
-    def _seed(self, iteration: int, purpose: str, part: int = 0) -> int:
-        """A seed for one purpose of one part of one iteration."""
-        return ((self.config.seed * 1000 + iteration) * 100 + part) * len(_PURPOSES) + _PURPOSES.index(purpose)
+    def _seed(self, iteration: int, purpose: str, part: int = 0, index: int = 0) -> int:
+        """A seed for one purpose of one part in one iteration, another one each time that the plan comes to the part."""
+        turn, parts = sum(part in step.parts for step in self.plan[:index]), self.partition.num_parts
+        slot = (self.config.seed * 1000 + iteration) * max(100, parts * len(self.plan)) + turn * parts + part
+        return slot * len(_PURPOSES) + _PURPOSES.index(purpose)
 
 
 def _judge(comparison: Comparison) -> tuple[bool, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -74,6 +74,10 @@ class TrainingRun:
     def make_problem(self, device: torch.device | str = "cpu") -> Problem:
         """The problem, partitioned as the algorithm needs it."""
         return make_problem(self.problem, partitioned=self.algorithm != "API", device=device)
+
+    def costs(self, folder: Path, policies: Iterable[str]) -> dict[str, Tensor]:
+        """Costs by evaluated policy, from the start states of the evaluation, of a run that was carried out in ``folder``."""
+        return {name: load_tensors(_costs_file(folder, name)) for name in policies}
 
     def carry_out(
         self,
@@ -167,7 +171,7 @@ class _Execution:
 
     def _costs(self, name: str, policy: Policy, states: int) -> Tensor:
         """Costs from the first evaluation states, computed once."""
-        path = self.folder / "costs" / f"{name}.pt"
+        path = _costs_file(self.folder, name)
         if path.is_file():
             return load_tensors(path)
         costs = discounted_costs(
@@ -182,6 +186,10 @@ class _Execution:
         ).cpu()
         save_tensors(path, costs)
         return costs
+
+
+def _costs_file(folder: Path, policy: str) -> Path:
+    return folder / "costs" / f"{policy}.pt"
 
 
 def _summary(iteration: Iteration) -> dict[str, Any]:
