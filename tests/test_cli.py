@@ -102,8 +102,8 @@ def test_a_run_folder_of_another_run_is_left_alone(tmp_path, capsys):
 def test_evaluate_by_name_and_online(policy, capsys):
     assert main(["evaluate", policy, "--problem", "line3", "--states", "10", "--online"]) == 0
     text = capsys.readouterr().out
-    assert "| greedy |" in text
-    assert f"| {policy} + R-NT |" in text
+    for name in ("greedy", "urgency", f"{policy} + R-NT"):
+        assert f"| {name} |" in text
 
 
 @pytest.mark.parametrize(

@@ -397,7 +397,8 @@ def test_models_without_a_partition_are_refused():
         {"iterations": 0}, {"samples_per_part": 0}, {"trajectories": 0}, {"max_steps": 0}, {"batch_size": 0},
         {"visits_per_label": 0.0}, {"memory_capacity": 0}, {"value_samples": 0}, {"validation_states": 0},
         {"value_hidden": (0,)}, {"epochs": 0}, {"least_steps": 0}, {"visited_share": 1.5},
-        {"exploration": -0.1}, {"learning_rate": 0.0}, {"hidden": ()}, {"loss": "L2"}, {"encoder": "Flat"}, {"allocation": "all"},
+        {"exploration": -0.1}, {"learning_rate": 0.0}, {"hidden": ()},
+        {"loss": "L2"}, {"encoder": "Flat"}, {"allocation": "all"},
     ],
 )  # fmt: skip
 def test_bad_numbers_are_named(change):
