@@ -216,6 +216,8 @@ class PolicyIteration:
     def _start(self) -> None:
         self.best: TensorDictModuleBase = self.base_policy
         self.memory = StateMemory(self.problem.model, self.config.memory_capacity, seed=self._seed(0, "visits"))
+        # Policies whose states are remembered once a step needs them; a step that is restored needs none.
+        self._unvisited: list[tuple[TensorDictModuleBase, int]] = []
         self._values: list[TensorDictModuleBase] = [self._scale] * self.partition.num_parts
 
     def __iter__(self) -> Iterator[Iteration]:
@@ -226,7 +228,7 @@ class PolicyIteration:
         policy = self.best
         best_costs = self._validate(policy, "base policy")
         for number in range(1, self.config.iterations + 1):
-            self._visit(policy, number - 1)
+            self._unvisited.append((policy, number - 1))
             local, values, records = self._iterate(number)
             policy = PartitionedPolicy(local).eval()
             costs = self._validate(policy, f"iteration {number}")
@@ -289,6 +291,8 @@ class PolicyIteration:
     ) -> dict[str, PartRecord]:
         """Label states of the step's parts, train their networks in place, and keep them."""
         step, name = self.plan[index], self._name(number, index)
+        while self._unvisited:
+            self._visit(*self._unvisited.pop(0))
         cache = self.folder / f"{name}.labels" if self.folder is not None else None
         make = partial(self._collector, index, PartitionedPolicy(local), PartitionedValue(values), number, cache)
         collectors = {part: make(part) for part in step.parts}
