@@ -199,14 +199,17 @@ def paired_table(problem: str, ratios: dict[str, dict[str, Estimate]]) -> str:
 
     Examples:
         >>> ratio = Estimate(mean=0.5, standard_error=0.0, count=2)
-        >>> print(paired_table("line3", {"pAPI-NT 1": {"R-NT of greedy": ratio}}))
-        | line3: ratio to | R-NT of greedy |
-        |---|---|
-        | pAPI-NT 1 | 0.5000 (0.5000 … 0.5000) |
+        >>> print(paired_table("line3", {"API 1": {"R-NT of greedy": ratio, "API 2": ratio}, "API 2": {"API 1": ratio}}))
+        | line3: ratio to | R-NT of greedy | API 2 |
+        |---|---|---|
+        | API 1 | 0.5000 (0.5000 … 0.5000) | 0.5000 (0.5000 … 0.5000) |
+        | API 2 |  |  |
     """
     columns = {other: None for row in ratios.values() for other in row}
-    last = {name.rpartition(" ")[0]: name for name in columns if name.rpartition(" ")[2].isdigit()}
-    shown = [name for name in columns if name in last.values() or not name.rpartition(" ")[2].isdigit()]
+    rollout = [name for name in columns if not name.rpartition(" ")[2].isdigit()]
+    # Rows are in the order of the iterations.
+    last = {name.rpartition(" ")[0]: name for name in ratios if name in columns and name not in rollout}
+    shown = [*rollout, *last.values()]
     lines = [f"| {problem}: ratio to | {' | '.join(shown)} |", f"|---|{'---|' * len(shown)}"]
     for name, row in ratios.items():
         cells = [_ratio_text(row[other]) if other in row else "" for other in shown]
