@@ -66,7 +66,8 @@ class TrainingRun:
     """Start states of each evaluation."""
 
     online_states: int = 1000
-    """Start states of the evaluation of online rollout on top of the trained policy, which takes longest; 0 for none."""
+    """Start states of the evaluation of online rollout on top of the trained policy, which takes longest: the first of the
+    ``states``, and no more; 0 for none."""
 
     online_trajectories: int = 10
     """Simulated trajectories of each control in online rollout."""
