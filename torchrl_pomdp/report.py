@@ -23,6 +23,7 @@ __all__ = [
     "effort",
     "effort_table",
     "interval_text",
+    "is_iteration",
     "iteration_figure",
     "paired_ratios",
     "paired_table",
@@ -166,6 +167,16 @@ def effort(iterations: Sequence[Mapping[str, Any]]) -> Effort:
     )
 
 
+def is_iteration(policy: str) -> bool:
+    """Whether a policy's name is that of what an iteration has trained.
+
+    Examples:
+        >>> is_iteration("pAPI-NT 2"), is_iteration("pAPI-NT 2 + R-NT"), is_iteration("greedy")
+        (True, False, False)
+    """
+    return policy.rpartition(" ")[2].isdigit()
+
+
 def paired_ratios(costs: dict[str, Tensor]) -> dict[str, dict[str, Estimate]]:
     """Ratios of what was trained, and of online rollout on top of it, to online rollout of the base policy and to each other.
 
@@ -181,7 +192,7 @@ def paired_ratios(costs: dict[str, Tensor]) -> dict[str, dict[str, Estimate]]:
         >>> {name: {other: round(ratio.mean, 2) for other, ratio in row.items()} for name, row in found.items()}
         {'API 1': {'R-NT of greedy': 0.5}, 'API 1 + R-NT': {'R-NT of greedy': 0.4, 'API 1': 0.8}}
     """
-    trained = [name for name in costs if name.rpartition(" ")[2].isdigit()]
+    trained = [name for name in costs if is_iteration(name)]
     rollout = [name for name in costs if name.startswith(("R-NT of", "R-T of"))]
     rows = [name for name in costs if name in trained or name.endswith("+ R-NT") or name.startswith("R-T of")]
     ratios: dict[str, dict[str, Estimate]] = {}
@@ -206,7 +217,7 @@ def paired_table(problem: str, ratios: dict[str, dict[str, Estimate]]) -> str:
         | API 2 |  |  |
     """
     columns = {other: None for row in ratios.values() for other in row}
-    rollout = [name for name in columns if not name.rpartition(" ")[2].isdigit()]
+    rollout = [name for name in columns if not is_iteration(name)]
     # Rows are in the order of the iterations.
     last = {name.rpartition(" ")[0]: name for name in ratios if name in columns and name not in rollout}
     shown = [*rollout, *last.values()]

@@ -21,6 +21,7 @@ from torchrl_pomdp.report import (
     cost_figure,
     effort_table,
     interval_text,
+    is_iteration,
     iteration_figure,
     paired_ratios,
     paired_table,
@@ -288,11 +289,6 @@ def _over_optimum(problem: str, comparison: Comparison) -> str:
     return f"{(low + high) / 2:.2f} % ± {(high - low) / 2:.2f}"
 
 
-def _is_iteration(policy: str, run: TrainingRun) -> bool:
-    """Whether a policy of that name is what an iteration of the run has trained."""
-    return policy.removeprefix(f"{run.algorithm} ").isdigit()
-
-
 def _iteration_labels(run: TrainingRun) -> int:
     parts = 1 if run.algorithm == "API" else 6
     values = 3 * run.config.value_samples if run.algorithm == "pAPI-T" else 0
@@ -322,7 +318,7 @@ def _draw(
     for name, run in planned.items():
         found = results[name]
         lines[f"{run.problem}, {run.algorithm}"] = [found[run.base]] + [
-            found[policy] for policy in found if _is_iteration(policy, run)
+            found[policy] for policy in found if is_iteration(policy)
         ]
     write_atomically(out / f"{title}-iterations.png", iteration_figure(lines).savefig)
     times = {f"{run.problem}, {run.algorithm}": iterations[name] for name, run in planned.items()}

@@ -12,8 +12,8 @@ import torch
 from torchrl_pomdp.envs.presets import PRESETS, Problem, make_problem
 from torchrl_pomdp.files import claim, load_tensors, save_tensors
 from torchrl_pomdp.modules import NeverRepairCost, PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
+from torchrl_pomdp.trainers.architecture import make_networks, make_values
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
-from torchrl_pomdp.trainers.policy_iteration import make_networks, make_values
 
 __all__ = ["Checkpoint", "load_checkpoint", "open_run_folder", "save_checkpoint"]
 

@@ -26,33 +26,29 @@ from torchrl.record.loggers import Logger
 
 from torchrl_pomdp.collectors import OnLabels, PartSampler, PolicyEvaluation, RolloutImprovement, StateMemory, training_states
 from torchrl_pomdp.envs.belief import BeliefEnv
-from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.envs.symmetry import symmetries
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import claim, load_tensors, save_tensors
 from torchrl_pomdp.modules import (
     Encoder,
-    FlatEncoder,
     NeverRepairCost,
     PartitionedPolicy,
     PartitionedValue,
     PolicyCost,
     PolicyNetwork,
-    RelativeEncoder,
     RolloutPolicy,
     Truncation,
-    ValueNetwork,
 )
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.objectives import ClassificationLoss, ValueLoss
+from torchrl_pomdp.trainers.architecture import ENCODERS, make_networks, make_values, partition_of
 from torchrl_pomdp.trainers.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.parts import PartRecord, train_part
 
-__all__ = ["Evaluate", "Improve", "Iteration", "PolicyIteration", "Step", "make_networks", "make_values"]
+__all__ = ["Evaluate", "Improve", "Iteration", "PolicyIteration", "Step"]
 
-_ENCODERS = {"flat": FlatEncoder, "relative": RelativeEncoder}
 # What seeds are for; an iteration's validation is the same for all iterations.
 _PURPOSES = ("weights", "states", "labels", "batches", "visits", "validation")
 
@@ -109,50 +105,6 @@ class Iteration:
     records: dict[str, PartRecord] = field(repr=False)
 
 
-def make_networks(
-    problem: Problem, config: PolicyIterationConfig, seed: int, encoder: Encoder | None = None
-) -> PartitionedPolicy:
-    """An untrained partitioned policy: one policy network for each part of the problem's partition.
-
-    Args:
-        problem: the problem.
-        config: sizes and encoding.
-        seed: seed of the initial weights.
-        encoder: encoder that the networks share; by default a new one as the configuration says.
-
-    Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> len(make_networks(make_problem("linear20"), PolicyIterationConfig(), seed=0).policies)
-        6
-    """
-    model = problem.model
-    generator = torch.Generator(device=model.device).manual_seed(seed)
-    encoder = encoder or _ENCODERS[config.encoder](model)
-    parts = range(_partition(problem).num_parts)
-    return PartitionedPolicy([PolicyNetwork(encoder, model.num_controls, config.hidden, generator=generator) for _ in parts])
-
-
-def make_values(problem: Problem, config: PolicyIterationConfig, seed: int, encoder: Encoder | None = None) -> PartitionedValue:
-    """An untrained partitioned value: one value network for each part, in multiples of the cost of never repairing.
-
-    Args:
-        problem: the problem.
-        config: sizes and encoding.
-        seed: seed of the initial weights.
-        encoder: encoder that the networks share; by default a new one as the configuration says.
-
-    Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> len(make_values(make_problem("linear20"), PolicyIterationConfig(), seed=0).values)
-        6
-    """
-    model = problem.model
-    generator = torch.Generator(device=model.device).manual_seed(seed)
-    encoder = encoder or _ENCODERS[config.encoder](model)
-    parts, scale = range(_partition(problem).num_parts), NeverRepairCost(model)
-    return PartitionedValue([ValueNetwork(encoder, scale, config.value_hidden, generator=generator) for _ in parts])
-
-
 class PolicyIteration:
     r"""Policy iteration from a base policy: its iterations, and the best policy so far. To iterate again is to start anew.
 
@@ -202,7 +154,7 @@ class PolicyIteration:
         progress: bool = False,
         on_labels: OnLabels | None = None,
     ) -> None:
-        self.partition = _partition(problem)
+        self.partition = partition_of(problem)
         if not plan:
             raise ValueError("plan is empty: an iteration needs at least one step")
         self.problem, self.config, self.base_policy, self.plan = problem, config, base_policy, tuple(plan)
@@ -210,7 +162,7 @@ class PolicyIteration:
         self.on_labels = on_labels
         self._scale = NeverRepairCost(problem.model)
         self._symmetries = symmetries(problem.model)[: None if config.symmetries else 1]
-        self._encoder = _shared_encoder(base_policy) or _ENCODERS[config.encoder](problem.model)
+        self._encoder = _shared_encoder(base_policy) or ENCODERS[config.encoder](problem.model)
         self._start()
 
     def _start(self) -> None:
@@ -407,9 +359,3 @@ def _shared_encoder(policy: TensorDictModuleBase) -> Encoder | None:
     """The encoder of a policy's networks, if it has any."""
     local = policy.policies if isinstance(policy, PartitionedPolicy) else [policy]
     return next((p.encoder for p in local if isinstance(p, PolicyNetwork)), None)
-
-
-def _partition(problem: Problem) -> Partition:
-    if problem.model.partition is None:
-        raise ValueError(f"the model of problem {problem.name!r} has no partition; give it one, SinglePart() for none")
-    return problem.model.partition
