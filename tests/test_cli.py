@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import signal
 import subprocess
@@ -9,17 +10,17 @@ import time
 import pytest
 import torch
 
+from torchrl_pomdp import commands, files
 from torchrl_pomdp.cli import main
 from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
-from torchrl_pomdp.files import write_atomically
 from torchrl_pomdp.modules import GreedyRepair
 from torchrl_pomdp.report import trajectory_figure
-from torchrl_pomdp.trainers.checkpoint import load_checkpoint
+from torchrl_pomdp.trainers import load_checkpoint
 
 TINY = (
-    "--iterations 1 --samples-per-part 60 --trajectories 2 --epochs 1 --least-steps 1 --batch-size 30 --max-steps 60 "
-    "--states 20 --validation-states 30 --visits-per-label 0.2 --value-samples 50"
+    "--iterations 1 --samples-per-part 30 --trajectories 1 --epochs 1 --least-steps 1 --batch-size 30 --max-steps 30 "
+    "--states 20 --validation-states 30 --visits-per-label 0.2 --value-samples 30 --hidden 8 --value-hidden 8"
 )
 
 
@@ -36,12 +37,13 @@ def test_train_evaluate_and_resume(tmp_path, capsys, algorithm):
     assert "line of 3, 1 robot: 3.8e+02 states" in text
     assert f"| {algorithm} 1 |" in text
     config = json.loads((out / "config.json").read_text())
-    assert (config["problem"], config["config"]["samples_per_part"]) == ("line3", 60)
+    assert (config["problem"], config["config"]["samples_per_part"]) == ("line3", 30)
     metrics = json.loads((out / "metrics.json").read_text())
     truncated = ["R-T of greedy"] if algorithm == "pAPI-T" else []
-    online = [] if not (out / "best.pt").is_file() else [f"{algorithm} 1 + R-NT"]
+    best = load_checkpoint(out / "best.pt")
     assert list(metrics)[:-1] == ["greedy", "urgency", "R-NT of greedy", *truncated, f"{algorithm} 1"]
-    assert list(metrics)[-1:] == (online or ["greedy + R-NT"])
+    assert list(metrics)[-1] == f"{best.name} + R-NT"
+    assert ("no iteration was accepted" in text.splitlines()[-1]) == (best.iteration == 0)
     assert metrics["greedy"]["ratio"]["mean"] == 1.0
     (iteration,) = json.loads((out / "iterations.json").read_text())
     assert iteration["accepted"] in (True, False)
@@ -109,16 +111,109 @@ def test_evaluate_by_name_and_online(policy, capsys):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["train", "linear21"], "unknown preset 'linear21'; known presets: grid5x4"),
-        (["evaluate", "nowhere.pt"], "there is no checkpoint nowhere.pt"),
-        (["evaluate", "greedy", "--states", "0"], "num_states must be at least 1"),
-        (["reproduce", "table1", "--scale", "0"], "scale must be positive, got 0"),
-        (["reproduce", "ablation", "--problems", "grid5x4"], "problems must be among ('linear20',) for ablation"),
+        ("train nosuch", "problem must be one of grid5x4, grid6x6, line3, linear20, two_robots20, got 'nosuch'"),
+        ("train line3 --states 0", "states must be an integer in"),
+        ("train line3 --online-states -5", "online_states must be an integer in"),
+        ("train line3 --iterations 0", "iterations must be an integer in 1..1000, got 0"),
+        ("train line3 --max-steps 100000000000", "max_steps must be"),
+        ("train line3 --visits-per-label inf", "visits_per_label must be a number in (0, 1000], got inf"),
+        ("train line3 --exploration nan", "exploration must be"),
+        ("train line3 --hidden 8 0", "hidden[1] must be"),
+        ("train line3 --seed -1", "seed must be"),
+        ("train line3 --device nonsense", "device must be a device of this machine such as cpu or cuda:0, got 'nonsense'"),
+        ("train line3 --device cuda:99", "device must be"),
+        ("train line3 --out FILE/run", "out must be a folder that can be written"),
+        ("train line3 --out FILE", "out must be a folder that can be written"),
+        ("train line3 --out /proc/run", "out must be a folder that can be written"),
+        ("evaluate nowhere.pt", "there is no checkpoint nowhere.pt"),
+        ("evaluate FILE", "is damaged or no"),
+        ("evaluate greedy --problem nosuch", "problem must be one of"),
+        ("evaluate greedy --states 0", "states must be"),
+        ("evaluate greedy --trajectories 0", "trajectories must be"),
+        ("evaluate greedy --seed -1", "seed must be"),
+        ("evaluate greedy --device nonsense", "device must be"),
+        ("reproduce table1 --scale 0", "scale must be a number in (0, 100], got 0"),
+        ("reproduce table1 --scale inf", "scale must be"),
+        ("reproduce table1 --scale nan", "scale must be"),
+        ("reproduce table1 --scale 1e9", "scale must be"),
+        ("reproduce table1 --seed -1", "seed must be"),
+        ("reproduce table1 --device nonsense", "device must be"),
+        ("reproduce table1 --out FILE/results", "out must be a folder that can be written"),
+        ("reproduce table1 --runs FILE/runs", "runs must be a folder that can be written"),
+        ("reproduce ablation --problems grid5x4", "problems must be among ('linear20',) for ablation"),
     ],
 )
-def test_bad_input_is_one_line_and_status_2(args, message, capsys):
-    assert main(args) == 2
-    assert message in capsys.readouterr().err
+def test_bad_input_is_one_line_status_2_and_leaves_nothing(args, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "FILE").write_text("no folder")
+    assert main(args.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("torchrl-pomdp: ")
+    assert message in line
+    assert [path.name for path in tmp_path.iterdir()] == ["FILE"], "the corrected command finds nothing in its way"
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), TypeError("of the wrong kind"), ValueError("a\nb")])
+def test_errors_while_it_runs_are_one_line(error, tmp_path, monkeypatch, capsys):
+    def fail(*args, **options):
+        raise error
+
+    monkeypatch.setattr(files, "write_bytes", fail)
+    assert main(["train", "line3", *TINY.split(), "--out", str(tmp_path / "run")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"torchrl-pomdp: {' '.join(str(error).split())}"
+
+
+def test_help_imports_nothing_heavy():
+    program = (
+        "import sys, time; from torchrl_pomdp.cli import main\ntry: main(['train', '--help'])\nexcept SystemExit: pass\n"
+        "print({'torch', 'torchrl', 'tensordict', 'numpy', 'matplotlib'} & set(sys.modules), time.process_time() < 1.0)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert "--samples-per-part" in done.stdout
+    assert done.stdout.splitlines()[-1] == "set() True"
+
+
+def test_a_terminal_that_cannot_show_everything_gets_what_it_can(monkeypatch):
+    """And what is no terminal gets no progress bars."""
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="ascii") for _ in range(2))
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", err)
+    assert main(["evaluate", "greedy", "--problem", "line3", "--states", "5"]) == 0
+    for stream in (out, err):
+        stream.flush()
+    assert b"| greedy | " in out.buffer.getvalue()
+    assert b" ? " in out.buffer.getvalue()
+    assert err.buffer.getvalue() == b""
+
+
+def test_without_matplotlib_the_table_is_printed(tmp_path, monkeypatch, capsys):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"] + ["matplotlib", "matplotlib.figure"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    assert main(["train", "line3", "--algorithm", "API", *TINY.split(), "--out", str(tmp_path / "run")]) == 0
+    text = capsys.readouterr().out
+    assert "| API 1 |" in text
+    assert "no pictures: pictures need matplotlib: pip install 'torchrl-pomdp[plot]'" in text.splitlines()
+    assert not list(tmp_path.rglob("*.png"))
+
+
+def test_a_failed_picture_does_not_lose_the_table(tmp_path, monkeypatch, capsys):
+    def fail(*args):
+        raise RuntimeError("no font")
+
+    monkeypatch.setattr(commands, "cost_figure", fail)
+    assert main(["train", "line3", "--algorithm", "API", *TINY.split(), "--out", str(tmp_path / "run")]) == 0
+    text = capsys.readouterr().out
+    assert text.index("| API 1 |") < text.index("no pictures: no font")
+
+
+def test_a_run_without_an_accepted_iteration_says_so_and_what_helps(tmp_path, capsys):
+    out = str(tmp_path / "run")
+    assert main(["train", "line3", "--base", "urgency", "--algorithm", "API", *TINY.split(), "--out", out]) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("no iteration was accepted: best.pt is the base policy, urgency. What usually helps: more --samples")
+    assert main(["evaluate", f"{out}/best.pt", "--states", "10", "--online"]) == 0
+    assert "| urgency + R-NT |" in capsys.readouterr().out
 
 
 def test_estimates_by_hand():
@@ -143,22 +238,9 @@ def test_evaluation_is_paired_by_state(linear20):
 def test_trajectory_picture_has_every_stage_and_repair(linear20):
     env = BeliefEnv(linear20.model, linear20.start)
     trajectory = env.rollout(30, GreedyRepair(linear20.model))
+    stages = trajectory.batch_size[0]
     figure = trajectory_figure(linear20.model, trajectory)
     axes = figure.axes[0]
-    assert axes.images[0].get_array().shape == (20, 30)
+    assert axes.images[0].get_array().shape == (20, stages)
     assert len(axes.collections[0].get_offsets()) == int((trajectory["action"] == 0).sum())
     assert axes.lines[0].get_ydata().tolist() == trajectory["location"][:, 0].tolist()
-
-
-def test_failed_writes_leave_the_old_file(tmp_path):
-    path = tmp_path / "a.txt"
-    path.write_text("old")
-
-    def fail(temporary):
-        temporary.write_text("half")
-        raise OSError("disk full")
-
-    with pytest.raises(OSError, match="disk full"):
-        write_atomically(path, fail)
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]

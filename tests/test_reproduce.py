@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
 from dataclasses import replace
 
 import pytest
 import torch
 from tqdm import tqdm
 
+from torchrl_pomdp import provenance as provenance_module
 from torchrl_pomdp import reproduce as module
 from torchrl_pomdp.evaluation import compare
+from torchrl_pomdp.provenance import provenance
+from torchrl_pomdp.report import Result, cost_figure, draw, iteration_figure, paired_table, table
 from torchrl_pomdp.reproduce import EXPERIMENTS, OPTIMA, Experiment, comparison_table, plan, reproduce, settings_config
 
 TOY = Experiment("toy", ("line3",), ("pAPI-NT", "pAPI-T"))
@@ -50,7 +55,9 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
             bars.append(None if self.disable else (self.total, self.n, self.initial))
             super().__exit__(*exc)
 
-    monkeypatch.setattr(module, "tqdm", Bar)
+    monkeypatch.setattr(
+        module, "progress_bar", lambda total, unit, desc, show, **options: Bar(total=total, unit=unit, disable=not show)
+    )
 
     def tiny(settings, problem, scale, seed):
         small = {
@@ -70,10 +77,14 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
         module, "plan", lambda *args: {k: replace(r, states=10, online_states=5) for k, r in original(*args).items()}
     )
     folders = {"runs": tmp_path / "runs", "out": tmp_path / "results"}
-    text = reproduce(TOY, scale=0.001, base="urgency", progress=True, **folders)
+    told = []
+    text = reproduce(TOY, scale=0.001, base="urgency", progress=True, tell=told.append, **folders)
+    assert told[0] == text
+    assert told[1].startswith("pictures: ")
     stem = "toy-tuned-urgency-scale0.001-seed0"
     content = json.loads((tmp_path / "results" / f"{stem}.json").read_text())
     assert content["provenance"]["versions"]["torch"] == torch.__version__
+    assert content["provenance"]["commit"] == provenance()["commit"]
     assert {run["algorithm"] for run in content["runs"].values()} == {"pAPI-NT", "pAPI-T"}
     for name, found in content["results"].items():
         assert {"greedy", "urgency"} <= set(found)
@@ -88,6 +99,52 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
     labels = 40 * (6 + 9)
     # Labels of an earlier run say nothing about the time that is left.
     assert bars == [(labels, labels, 0), (labels, labels, labels), None]
+
+
+def test_a_ratio_that_means_nothing_is_a_dash(tmp_path):
+    cost = torch.tensor([-1.0, 1.0])
+    found = replace(compare(cost + 5, cost + 5), ratio=None)
+    dash = ["–", "–"]
+    for text in (table([Result("greedy", found)]), comparison_table({"a": ("grid5x4", {"greedy": found})})):
+        assert [cell.strip() for cell in text.splitlines()[-1].split("|")].count("–") == len(dash)
+    assert paired_table("line3", {"API 1": {"R-NT of greedy": None}}).splitlines()[-1] == "| API 1 | – |"
+    assert "–" in [label.get_text().split("\n")[-1] for label in cost_figure([Result("a", found)]).axes[0].get_xticklabels()]
+    figures = {tmp_path / "lines.png": lambda: iteration_figure({"a": [found, compare(cost + 5, cost + 5)]})}
+    assert draw(figures) == f"pictures: {tmp_path / 'lines.png'}"
+
+
+def test_the_commit_is_that_of_this_librarys_checkout(tmp_path, monkeypatch):
+    """And none where the library lies in the folder of another checkout, or git is not there."""
+    git = shutil.which("git")
+    if git is None:
+        pytest.skip("git is not there")
+    package = tmp_path / "checkout" / "package"
+    package.mkdir(parents=True)
+    file = package / "provenance.py"
+    file.write_text("")
+    monkeypatch.setattr(provenance_module, "__file__", str(file))
+
+    def run(*arguments):
+        settings = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        done = subprocess.run(
+            [git, "-C", str(package.parent), *settings, *arguments], capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    assert provenance()["commit"] is None
+    run("init")
+    assert provenance()["commit"] is None
+    run("add", ".")
+    run("commit", "-m", "first", "--no-gpg-sign")
+    commit = run("rev-parse", "HEAD")
+    assert provenance()["commit"] == commit
+    (package / "untracked").write_text("")
+    monkeypatch.setenv("GIT_DIR", "/nowhere")
+    assert provenance()["commit"] == commit
+    file.write_text("changed")
+    assert provenance()["commit"] == f"{commit}-dirty"
+    monkeypatch.setenv("PATH", "")
+    assert provenance()["commit"] is None
 
 
 def test_only_the_experiments_own_problems_can_be_chosen():

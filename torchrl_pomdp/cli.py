@@ -1,29 +1,27 @@
-"""The command ``torchrl-pomdp``: train policies, evaluate them, reproduce the paper's experiments."""
+"""The command ``torchrl-pomdp``: train policies, evaluate them, reproduce the paper's experiments.
+
+Nothing that takes long to import is imported before the arguments are read.
+"""
 
 from __future__ import annotations
 
+import io
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-import torch
 import tyro
-from tensordict.nn import TensorDictModuleBase
-from torchrl import logger as torchrl_logger
 
-from torchrl_pomdp.envs import BeliefEnv, Problem, make_problem
-from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.files import write_atomically, write_json
-from torchrl_pomdp.modules import NeverRepairCost, Policy
-from torchrl_pomdp.noise import fold, seed_keys
-from torchrl_pomdp.provenance import provenance
-from torchrl_pomdp.report import Result, cost_figure, table, trajectory_figure
-from torchrl_pomdp.reproduce import EXPERIMENTS, reproduce
-from torchrl_pomdp.trainers import r_nt
-from torchrl_pomdp.trainers.checkpoint import load_checkpoint
-from torchrl_pomdp.trainers.config import PolicyIterationConfig
-from torchrl_pomdp.trainers.run import BASE_POLICIES, EVALUATION_SEED, TrainingRun
+from torchrl_pomdp.config import EVALUATION_SEED, PolicyIterationConfig
+
+
+@dataclass(frozen=True)
+class Numbers(PolicyIterationConfig):
+    """The numbers of the policy iteration."""
+
+    def __post_init__(self) -> None:
+        """Checked once all arguments are read, with them."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class Train:
     base: Literal["greedy", "urgency"] = "greedy"
     """Base policy that is improved first."""
 
-    config: tyro.conf.OmitArgPrefixes[PolicyIterationConfig] = field(default_factory=PolicyIterationConfig)
+    config: tyro.conf.OmitArgPrefixes[Numbers] = field(default_factory=Numbers)
 
     out: Path | None = None
     """Folder of the run: new, empty, or that of the same run; by default runs/PROBLEM-ALGORITHM-BASE-seedSEED."""
@@ -115,105 +113,31 @@ class Reproduce:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command with ``args`` (default: the process's); returns the exit status, 2 for input that was refused."""
-    torchrl_logger.setLevel("WARNING")
-    commands = (
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # What a terminal cannot show is no reason to lose a table.
+        sys.stdout.reconfigure(errors="replace")
+    choices = (
         Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
     )
-    command: Train | Evaluate | Reproduce = tyro.cli(commands, prog="torchrl-pomdp", args=args)
+    command: Train | Evaluate | Reproduce = tyro.cli(choices, prog="torchrl-pomdp", args=args)
+    from torchrl import logger
+
+    from torchrl_pomdp import commands
+
+    logger.setLevel("WARNING")
     try:
         if isinstance(command, Train):
-            _train(command)
+            commands.train(command)
         elif isinstance(command, Evaluate):
-            _evaluate(command)
+            commands.evaluate(command)
         else:
-            _reproduce(command)
-    except ValueError as error:
-        print(f"torchrl-pomdp: {error}", file=sys.stderr)
+            commands.reproduce(command)
+    except (ValueError, TypeError, OSError) as error:
+        print(f"torchrl-pomdp: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     return 0
-
-
-def _train(command: Train) -> None:
-    run = TrainingRun(command.problem, command.algorithm, command.base, command.config, command.states, command.online_states)
-    problem = run.make_problem(command.device)
-    default = f"{command.problem}-{command.algorithm}-{command.base}-seed{command.config.seed}"
-    out = command.out or Path("runs") / default
-    print(f"{problem.name}: {problem.model.describe()}\nrun folder: {out}")
-    comparisons = run.carry_out(out, device=command.device, progress=True, report=_tell)
-    write_json(out / "provenance.json", provenance())
-    results = [Result(name, comparison) for name, comparison in comparisons.items()]
-    title = f"{problem.name}, {command.states} start states; below each policy its ratio to greedy"
-    write_atomically(out / "costs.png", lambda path: cost_figure(results, title).savefig(path))
-    best = load_checkpoint(out / "best.pt", device=command.device).policy if (out / "best.pt").is_file() else None
-    _save_trajectory(problem, best or BASE_POLICIES[command.base](problem.model), out / "trajectory.png")
-    print(f"\n{table(results)}\n\npictures: {out / 'costs.png'}, {out / 'trajectory.png'}")
-
-
-def _tell(name: str, comparison: Comparison) -> None:
-    low, high = comparison.ratio.interval
-    print(f"{name}: {comparison.ratio.mean:.3f} of greedy ({low:.3f} … {high:.3f})", flush=True)
-
-
-def _evaluate(command: Evaluate) -> None:
-    problem, policy, name = _named_policy(command)
-    policies: dict[str, Policy] = {base: make(problem.model) for base, make in BASE_POLICIES.items()}
-    if command.online:
-        name, policy = f"{name} + R-NT", r_nt(problem, policy, trajectories=command.trajectories)
-    policies.setdefault(name, policy)
-    costs = {
-        name: discounted_costs(
-            problem.model,
-            policy,
-            problem.start,
-            num_states=command.states,
-            seed=command.seed,
-            terminal_cost=NeverRepairCost(problem.model),
-            progress=True,
-            name=f"evaluate {name}",
-        )
-        for name, policy in policies.items()
-    }
-    print(f"{problem.name}: {problem.model.describe()}; {command.states} start states, seed {command.seed}\n")
-    print(table([Result(name, compare(cost, costs["greedy"])) for name, cost in costs.items()]))
-
-
-def _named_policy(command: Evaluate) -> tuple[Problem, TensorDictModuleBase, str]:
-    """The problem, the policy and its name that ``evaluate`` was asked for."""
-    if command.policy in BASE_POLICIES:
-        problem = make_problem(command.problem, device=command.device)
-        return problem, BASE_POLICIES[command.policy](problem.model), command.policy
-    checkpoint = load_checkpoint(Path(command.policy), device=command.device)
-    return checkpoint.problem, checkpoint.policy, f"{checkpoint.algorithm} {checkpoint.iteration}"
-
-
-def _reproduce(command: Reproduce) -> None:
-    experiment = EXPERIMENTS[command.experiment]
-    text = reproduce(
-        experiment,
-        scale=command.scale,
-        settings=command.settings,
-        base=command.base,
-        problems=command.problems,
-        seed=command.seed,
-        runs=command.runs,
-        out=command.out,
-        device=command.device,
-        report=lambda run, name, comparison: _tell(f"{run}, {name}", comparison),
-        progress=True,
-    )
-    print(f"\n{text}")
-
-
-def _save_trajectory(problem: Problem, policy: Policy, path: Path) -> None:
-    """Draw the trajectory of ``policy`` from the first start state of the evaluations."""
-    env = BeliefEnv(problem.model, problem.start, seed=EVALUATION_SEED)
-    y = env.reset(problem.start(fold(seed_keys(EVALUATION_SEED, torch.tensor(0)), 0)), set_state=True)
-    with torch.no_grad():
-        trajectory = env.rollout(200, policy, tensordict=y, auto_reset=False)
-    figure = trajectory_figure(problem.model, trajectory, f"{problem.name}: one trajectory of the best policy")
-    write_atomically(path, figure.savefig)
 
 
 if __name__ == "__main__":

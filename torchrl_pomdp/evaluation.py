@@ -9,12 +9,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_tensor, check_text
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.noise import fold, seed_keys
+from torchrl_pomdp.progress import progress_bar
 
 __all__ = ["Comparison", "Estimate", "compare", "discounted_costs", "estimate"]
 
+# Most start states of an evaluation: their costs are kept together.
+MAX_STATES = 10**8
 # Half width of a 95 % interval in standard errors.
 _Z95 = 1.96
 
@@ -47,12 +51,13 @@ class Comparison:
     Attributes:
         cost: discounted cost of the policy.
         difference: policy minus baseline.
-        ratio: mean cost over the baseline's mean cost, its standard error by the delta method.
+        ratio: mean cost over the baseline's mean cost, its standard error by the delta method. None where it means nothing:
+            the baseline's mean is not positive, or, with costs of both signs, not clearly so.
     """
 
     cost: Estimate
     difference: Estimate
-    ratio: Estimate
+    ratio: Estimate | None
 
 
 def discounted_costs(
@@ -88,6 +93,7 @@ def discounted_costs(
         costs ``[num_states]``.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if ``num_states`` is not positive, or by :class:`TruncatedRollout`.
 
     Examples:
@@ -98,12 +104,15 @@ def discounted_costs(
         >>> estimate(costs).count
         50
     """
-    if num_states < 1:
-        raise ValueError(f"num_states must be at least 1, got {num_states}")
+    check_instance("model", model, BeliefModel)
+    check_callable("policy", policy)
+    check_callable("start", start)
+    num_states = check_integer("num_states", num_states, 1, MAX_STATES)
+    seed = check_integer("seed", seed)
     keys = seed_keys(seed, torch.arange(num_states, device=model.device))
-    with tqdm(unit="step", unit_scale=True, desc=name, disable=not progress, leave=False) as bar:
+    with progress_bar(None, "step", check_text("name", name), check_flag("progress", progress)) as bar:
         cost = TruncatedRollout(model, _Watched(policy, bar), max_steps=max_steps, terminal_cost=terminal_cost)
-        return cost(start(fold(keys, 0)), fold(keys, 1))
+        return cost(model.drawn(start, fold(keys, 0)), fold(keys, 1))
 
 
 class _Watched:
@@ -121,11 +130,15 @@ class _Watched:
 def estimate(values: Tensor) -> Estimate:
     """Mean and standard error of independent values ``[N]``; the error is NaN for a single value.
 
+    Raises:
+        TypeError: if they are no tensor of real numbers.
+        ValueError: if there are none, or one is not finite.
+
     Examples:
         >>> estimate(torch.tensor([1.0, 3.0]))
         Estimate(mean=2.0, standard_error=1.0, count=2)
     """
-    values = values.double()
+    values = _sample("values", values)
     error = values.std() / values.numel() ** 0.5 if values.numel() > 1 else torch.tensor(torch.nan)
     return Estimate(float(values.mean()), float(error), values.numel())
 
@@ -133,21 +146,45 @@ def estimate(values: Tensor) -> Estimate:
 def compare(costs: Tensor, baseline: Tensor) -> Comparison:
     """Compare paired costs ``[N]`` with a baseline's ``[N]``.
 
+    The difference always means something. A ratio does so where the baseline's mean is a positive cost; see
+    :class:`Comparison`.
+
     Raises:
-        ValueError: if the shapes differ.
+        TypeError: if they are no tensors of real numbers.
+        ValueError: if there are none, one is not finite, or the shapes differ.
 
     Examples:
         >>> compare(torch.tensor([9.0, 18.0]), torch.tensor([10.0, 20.0])).ratio
         Estimate(mean=0.9, standard_error=0.0, count=2)
+        >>> rewards = compare(torch.tensor([-9.0, -8.0]), torch.tensor([-3.0, -2.0]))
+        >>> rewards.difference.mean, rewards.ratio
+        (-6.0, None)
     """
+    costs, baseline = _sample("costs", costs), _sample("baseline", baseline)
     if costs.shape != baseline.shape:
         raise ValueError(f"costs and baseline must be paired, got shapes {tuple(costs.shape)} and {tuple(baseline.shape)}")
-    costs, baseline = costs.double(), baseline.double()
-    mean = baseline.mean()
-    ratio = float(costs.mean() / mean)
-    residual = estimate((costs - ratio * baseline) / mean)
     return Comparison(
         cost=estimate(costs),
         difference=estimate(costs - baseline),
-        ratio=Estimate(ratio, residual.standard_error, costs.numel()),
+        ratio=_ratio(costs, baseline) if _is_positive(baseline) else None,
     )
+
+
+def _sample(name: str, values: Tensor) -> Tensor:
+    values = check_tensor(name, check_instance(name, values, Tensor), (None,)).double()
+    if values.numel() == 0:
+        raise ValueError(f"{name} must hold at least one value, got none")
+    return values
+
+
+def _is_positive(baseline: Tensor) -> bool:
+    """Whether the mean can be divided by: it is positive, and clearly so where single costs are negative."""
+    mean = estimate(baseline)
+    return mean.mean > 0.0 and (bool((baseline >= 0.0).all()) or mean.interval[0] > 0.0)
+
+
+def _ratio(costs: Tensor, baseline: Tensor) -> Estimate:
+    mean = baseline.mean()
+    ratio = float(costs.mean() / mean)
+    residual = estimate((costs - ratio * baseline) / mean)
+    return Estimate(ratio, residual.standard_error, costs.numel())

@@ -1,47 +1,153 @@
-"""Files that are whole or absent, and tensors that are loaded without unpickling."""
+"""Files that are whole or absent, checked before they are read, and tensors that are loaded without unpickling."""
 
 from __future__ import annotations
 
+import io
 import json
+import math
 import os
-from collections.abc import Callable
+import secrets
+import tempfile
+import zipfile
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
+from torchrl_pomdp.checks import check_device, check_instance, check_path, shown
 
-__all__ = ["claim", "load_tensors", "save_tensors", "write_atomically", "write_json"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = [
+    "DamagedFileError",
+    "check_folder",
+    "claim",
+    "load_tensors",
+    "parse_tensors",
+    "read_json",
+    "save_tensors",
+    "tensor_bytes",
+    "write_bytes",
+    "write_json",
+]
 
 
-def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let ``write`` make a temporary file beside ``path``, then rename it: ``path`` is never seen half written.
+class DamagedFileError(ValueError):
+    """A file is not what was written; the message names it and says what to do."""
+
+
+def write_bytes(path: str | PathLike[str], content: bytes) -> None:
+    """Write ``content`` to a new temporary file beside ``path``, then rename it: ``path`` is never seen half written.
+
+    The temporary file has a random name and is made, never opened through something that lies there.
 
     Args:
         path: the file to make or replace; its folder is made if it is not there.
-        write: called with the temporary path, which has the suffix of ``path``.
+        content: what it shall hold.
+
+    Raises:
+        TypeError: if ``path`` is no path or ``content`` no bytes.
+        OSError: if the file cannot be written; nothing is left behind.
 
     Examples:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_atomically(Path(folder) / "a.txt", lambda path: path.write_text("whole"))
+        ...     write_bytes(Path(folder) / "a.txt", b"whole")
         ...     (Path(folder) / "a.txt").read_text()
         'whole'
     """
+    path = check_path("path", path)
+    check_instance("content", content, bytes)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    temporary = path.with_name(f".{path.stem[:64]}.{secrets.token_hex(8)}{path.suffix}")
+    handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
     try:
-        write(temporary)
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(handle)
         os.replace(temporary, path)
-    finally:
+    except BaseException:
         temporary.unlink(missing_ok=True)
+        raise
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write ``content`` as JSON, atomically."""
-    write_atomically(path, lambda temporary: temporary.write_text(json.dumps(content, indent=2) + "\n"))
+def check_folder(name: str, path: str | PathLike[str]) -> Path:
+    """A folder that can be written, or made; nothing is left in it.
+
+    Args:
+        name: name of the argument.
+        path: the folder, which need not be there.
+
+    Raises:
+        TypeError: if it is no path.
+        ValueError: if it is no folder, or nothing can be written there.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     check_folder("out", Path(folder) / "run").exists()
+        False
+    """
+    path = check_path(name, path)
+    try:
+        there = next(p for p in (path, *path.absolute().parents) if p.exists())
+        with tempfile.TemporaryFile(dir=there):
+            return path
+    except OSError as error:
+        raise ValueError(f"{name} must be a folder that can be written, {path} cannot: {error.strerror or error}") from error
 
 
-def claim(path: Path, identity: dict[str, Any]) -> None:
+def write_json(path: str | PathLike[str], content: Any) -> None:
+    """Write ``content`` as JSON, atomically; numbers that are not finite, which JSON does not have, become null.
+
+    Raises:
+        TypeError: if ``path`` is no path or ``content`` nothing that JSON has.
+        OSError: if the file cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_json(Path(folder) / "a.json", {"error": math.nan})
+        ...     read_json(Path(folder) / "a.json")
+        {'error': None}
+    """
+    write_bytes(path, _json("content", content).encode())
+
+
+def _json(name: str, content: Any) -> str:
+    try:
+        return json.dumps(_finite(content), indent=2, allow_nan=False) + "\n"
+    except (TypeError, ValueError, RecursionError) as error:
+        raise TypeError(f"{name} must be what JSON has, got {shown(content)}: {error}") from error
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+def read_json(path: str | PathLike[str]) -> dict[str, Any]:
+    """Read an object that :func:`write_json` wrote.
+
+    Raises:
+        TypeError: if ``path`` is no path.
+        DamagedFileError: if the file holds anything else.
+    """
+    path = check_path("path", path)
+    try:
+        content = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError(f"{path} is damaged, it holds no JSON ({error}): restore it or name another folder") from error
+    if not isinstance(content, dict):
+        raise DamagedFileError(f"{path} is damaged, it holds no JSON object: restore it or name another folder")
+    return content
+
+
+def claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
     """Write down whose folder it is, or make sure that it is still the same one's.
 
     Args:
@@ -49,7 +155,8 @@ def claim(path: Path, identity: dict[str, Any]) -> None:
         identity: all that decides the results of what is kept beside it, as JSON.
 
     Raises:
-        ValueError: if the record says otherwise; it is left as it is.
+        TypeError: if ``path`` is no path or ``identity`` is not what JSON has.
+        ValueError: if the record says otherwise or is damaged; it is left as it is.
 
     Examples:
         >>> import tempfile
@@ -59,29 +166,110 @@ def claim(path: Path, identity: dict[str, Any]) -> None:
         ...     sorted(path.name for path in Path(folder).iterdir())
         ['config.json']
     """
+    path = check_path("path", path)
+    given = json.loads(_json("identity", check_instance("identity", identity, dict)))
     if not path.is_file():
-        write_json(path, identity)
+        write_json(path, given)
         return
-    found, given = json.loads(path.read_text()), json.loads(json.dumps(identity))
-    differing = sorted(key for key in {*found, *given} if found.get(key) != given.get(key))
+    found = read_json(path)
+    nothing = object()
+    differing = sorted(key for key in {*found, *given} if found.get(key, nothing) != given.get(key, nothing))
     if differing:
         what = ", ".join(differing)
         raise ValueError(f"run folder {path.parent} holds another run, which differs in {what}: name another folder")
 
 
-def save_tensors(path: Path, content: Any) -> None:
-    """Write nested dictionaries of tensors, numbers and texts, atomically.
+def save_tensors(path: str | PathLike[str], content: dict[str, Any]) -> None:
+    """Write nested dictionaries of tensors, numbers and texts, atomically; equal content gives equal bytes.
+
+    Raises:
+        TypeError: if ``path`` is no path or ``content`` holds anything else.
+        OSError: if the file cannot be written.
 
     Examples:
-        >>> import tempfile
+        >>> import tempfile, torch
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save_tensors(Path(folder) / "a.pt", {"x": torch.arange(3)})
         ...     load_tensors(Path(folder) / "a.pt")["x"].tolist()
         [0, 1, 2]
     """
-    write_atomically(path, lambda temporary: torch.save(content, temporary))
+    write_bytes(path, tensor_bytes(content))
 
 
-def load_tensors(path: Path, device: torch.device | str = "cpu") -> Any:
-    """Read what :func:`save_tensors` wrote; nothing is unpickled."""
-    return torch.load(path, map_location=device, weights_only=True)
+def tensor_bytes(content: dict[str, Any]) -> bytes:
+    """What :func:`save_tensors` writes.
+
+    Raises:
+        TypeError: if ``content`` holds anything but tensors, numbers, texts and dictionaries of them.
+
+    Examples:
+        >>> import torch
+        >>> tensor_bytes({"x": torch.arange(3)}) == tensor_bytes({"x": torch.arange(3)})
+        True
+    """
+    import torch
+
+    _check_content("content", check_instance("content", content, dict), torch.Tensor)
+    # Saved to a path, the archive would hold the name of the temporary file.
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue()
+
+
+def _check_content(name: str, value: Any, tensor: type) -> None:
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            _check_content(f"{name}[{shown(key)}]", entry, tensor)
+    elif not isinstance(value, (tensor, str, int, float, type(None))):
+        raise TypeError(f"{name} must be a tensor, a number, a text or a dictionary of them, got {shown(value)}")
+
+
+def load_tensors(path: str | PathLike[str], device: torch.device | str = "cpu") -> Any:
+    """Read what :func:`save_tensors` wrote; nothing is unpickled.
+
+    Raises:
+        TypeError: if ``path`` is no path.
+        DamagedFileError: if the file is not as it was written, or of another kind.
+        ValueError: if there is no such device.
+    """
+    path = check_path("path", path)
+    return parse_tensors(path.read_bytes(), path, device)
+
+
+def parse_tensors(content: bytes, path: str | PathLike[str], device: torch.device | str = "cpu") -> Any:
+    """What the content of a file stands for that :func:`save_tensors` wrote.
+
+    PyTorch does not look at the check sums that an archive has for its files, so they are compared first.
+
+    Args:
+        content: the bytes.
+        path: the file that they are of, for messages.
+        device: where tensors are put.
+
+    Raises:
+        TypeError: if ``content`` is no bytes or ``path`` no path.
+        DamagedFileError: if they are not as they were written, or of another kind.
+        ValueError: if there is no such device.
+    """
+    import torch
+
+    path, device = check_path("path", path), check_device("device", device)
+    check_instance("content", content, bytes)
+    try:
+        _check_archive(content)
+        return torch.load(io.BytesIO(content), map_location=device, weights_only=True)
+    except Exception as error:  # torch.load raises whatever a foreign file happens to trigger
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise DamagedFileError(f"{path} is damaged or no file of this library, delete it: {reason}") from error
+
+
+def _check_archive(content: bytes) -> None:
+    """Raise unless ``content`` is an archive of stored files that agree with their check sums."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        files = archive.infolist()
+        # Tensors are stored as they are; a small archive that unfolds to a huge one is none of ours.
+        if any(file.compress_type != zipfile.ZIP_STORED or file.file_size > len(content) for file in files):
+            raise ValueError("the archive holds compressed files")
+        damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"the check sum of {damaged} is wrong")

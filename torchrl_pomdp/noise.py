@@ -11,7 +11,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-__all__ = ["fingerprint", "fold", "seed_keys", "uniform"]
+from torchrl_pomdp.checks import check_integer, check_keys
+
+__all__ = ["fingerprint", "fold", "permuted", "seed_keys", "uniform"]
 
 
 def _signed(value: int) -> int:
@@ -24,6 +26,9 @@ _GOLDEN = 0x9E3779B97F4A7C15
 _FIRST, _SECOND = _signed(0xBF58476D1CE4E5B9), _signed(0x94D049BB133111EB)
 _LOW_34, _LOW_37, _LOW_33 = (1 << 34) - 1, (1 << 37) - 1, (1 << 33) - 1
 _UNIT = 2.0**-24
+# Rounds of a permutation: pairs of members that no round tells apart are a fraction of 4**-12. Their numbers come from Knuth's
+# linear congruential generator.
+_ROUNDS, _FACTOR, _STEP = 12, 6364136223846793005, 1442695040888963407
 
 
 def _mix(x: Tensor) -> Tensor:
@@ -69,6 +74,38 @@ def uniform(keys: Tensor, counter: int | Tensor) -> Tensor:
     return ((fold(keys, counter) >> 40) & 0xFFFFFF).to(torch.float32) * _UNIT
 
 
+def permuted(keys: Tensor, members: Tensor, count: int) -> Tensor:
+    """Places of ``members`` in random permutations of 0..count-1, one permutation for each key.
+
+    A rotation, then rounds of the swap-or-not shuffle (Hoang, Morris and Rogaway 2012), which computes the place of one member
+    without the others. The rotation alone makes every place equally likely, and is all there is to permute for two members.
+
+    Args:
+        keys: int64 ``[*B]``; equal keys have the same permutation, those of different keys are independent.
+        members: int64 ``[*B]`` in 0..count-1.
+        count: number of members, at most 2**24.
+
+    Returns:
+        int64 ``[*B]`` in 0..count-1.
+
+    Examples:
+        >>> sorted(permuted(torch.full((5,), 7), torch.arange(5), 5).tolist())
+        [0, 1, 2, 3, 4]
+    """
+    place = (members + (((keys >> 40) & 0xFFFFFF) * count >> 24)) % count
+    if count < 3:
+        return place
+    state = keys
+    for _ in range(_ROUNDS):
+        state = state * _FACTOR + _STEP
+        partner = (((state >> 33) & 0x7FFFFFFF) * count >> 31) - place
+        partner = partner + (count & (partner >> 63))
+        # A pair is swapped, or not, by a bit of its larger place.
+        swap = (state ^ torch.maximum(place, partner) * _signed(_GOLDEN)) * _FIRST < 0
+        place = torch.where(swap, partner, place)
+    return place
+
+
 def seed_keys(seed: int, index: Tensor) -> Tensor:
     """Keys of items ``index`` under ``seed``: the same item has the same key in whichever batch it is drawn.
 
@@ -79,11 +116,15 @@ def seed_keys(seed: int, index: Tensor) -> Tensor:
     Returns:
         int64 ``[*B]``.
 
+    Raises:
+        TypeError: if ``seed`` is no integer or ``index`` no int64 tensor.
+
     Examples:
         >>> torch.equal(seed_keys(3, torch.arange(10))[4:], seed_keys(3, torch.arange(4, 10)))
         True
     """
-    return fold(fold(torch.full_like(index, _signed(seed)), 0), index)
+    seed = check_integer("seed", seed)
+    return fold(fold(torch.full_like(check_keys("index", index), _signed(seed)), 0), index)
 
 
 def fingerprint(y: TensorDictBase) -> Tensor:

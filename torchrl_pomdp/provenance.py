@@ -1,9 +1,10 @@
-"""What results were taken with: versions, hardware, threads."""
+"""What results were taken with: commit, versions, hardware, threads."""
 
 from __future__ import annotations
 
 import os
 import platform
+import subprocess
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,22 +17,44 @@ _PACKAGES = ("torchrl-pomdp", "torch", "torchrl", "tensordict")
 
 
 def provenance(*packages: str) -> dict[str, Any]:
-    """Versions, hardware and threads, to put beside results.
+    """Commit, versions, hardware and threads, to put beside results.
 
     Args:
         packages: further packages whose versions matter.
 
     Examples:
         >>> sorted(provenance())
-        ['cores', 'cpu', 'python', 'threads', 'versions']
+        ['commit', 'cores', 'cpu', 'python', 'threads', 'versions']
     """
     return {
+        "commit": _commit(),
         "cpu": _cpu(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
         "versions": {name: version(name) for name in (*_PACKAGES, *packages)},
     }
+
+
+def _commit() -> str | None:
+    """Commit of the checkout that this library runs from, ``-dirty`` if its files differ; None if it runs from none."""
+    # The folder may lie in the checkout of something else, such as an environment's.
+    if _git("ls-files", "--error-unmatch", Path(__file__).name) is None:
+        return None
+    commit, changed = _git("rev-parse", "HEAD"), _git("status", "--porcelain", "--untracked-files=no")
+    return f"{commit}-dirty" if commit and changed else commit
+
+
+def _git(*arguments: str) -> str | None:
+    """What git prints about this file's folder; None where it fails or is not there."""
+    # A hook that git runs is told of another repository in these.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.decode(errors="replace").strip()
 
 
 def _cpu() -> str:

@@ -6,29 +6,48 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from torchrl_pomdp.checks import (
+    check_callable,
+    check_choice,
+    check_device,
+    check_flag,
+    check_instance,
+    check_integer,
+    check_number,
+    check_sequence,
+    check_text,
+)
+from torchrl_pomdp.config import PolicyIterationConfig
+from torchrl_pomdp.envs import PRESETS
 from torchrl_pomdp.evaluation import Comparison, Estimate
-from torchrl_pomdp.files import write_atomically, write_json
+from torchrl_pomdp.files import check_folder, write_bytes, write_json
+from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import (
     Result,
     cost_figure,
+    draw,
     effort_table,
     interval_text,
     is_iteration,
     iteration_figure,
     paired_ratios,
     paired_table,
+    ratio_texts,
     time_figure,
 )
-from torchrl_pomdp.trainers.config import PolicyIterationConfig
-from torchrl_pomdp.trainers.run import TrainingRun
+from torchrl_pomdp.trainers.run import ALGORITHMS, TrainingRun
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["EXPERIMENTS", "OPTIMA", "PUBLISHED", "Experiment", "plan", "reproduce", "settings_config"]
 
@@ -62,12 +81,24 @@ class Experiment:
         problems: names of the problems.
         algorithms: names of the algorithms that learn.
         states: start states of each evaluation.
+
+    Raises:
+        TypeError: if something is of the wrong kind.
+        ValueError: if a problem or an algorithm is unknown, or ``states`` is not positive.
     """
 
     name: str
     problems: tuple[str, ...]
     algorithms: tuple[Literal["pAPI-NT", "pAPI-T", "API"], ...]
     states: int = 1000
+
+    def __post_init__(self) -> None:
+        check_text("name", self.name)
+        for problem in check_sequence("problems", self.problems, str, least=1):
+            check_choice("problems", problem, sorted(PRESETS))
+        for algorithm in check_sequence("algorithms", self.algorithms, str, least=1):
+            check_choice("algorithms", algorithm, ALGORITHMS)
+        check_integer("states", self.states, 1, 10**9)
 
 
 EXPERIMENTS = {
@@ -91,18 +122,20 @@ def settings_config(settings: Literal["paper", "tuned"], problem: str, scale: fl
             images. The paper leaves open the share of states from the memory, a half here, and the number of epochs.
             ``"tuned"``: the configuration's defaults, what has worked best here.
         problem: name of the problem.
-        scale: fraction of the paper's samples, positive.
+        scale: fraction of the paper's samples, in (0, 100].
         seed: seed of the training.
 
     Raises:
-        ValueError: if ``scale`` is not positive.
+        TypeError: if something is of the wrong kind.
+        ValueError: if ``settings`` or ``problem`` is unknown, or ``scale`` or ``seed`` out of range.
 
     Examples:
         >>> settings_config("paper", "linear20", 0.5, seed=0).samples_per_part
         100000
     """
-    if not scale > 0:
-        raise ValueError(f"scale must be positive, got {scale}")
+    check_choice("settings", settings, ("paper", "tuned"))
+    check_choice("problem", problem, sorted(PRESETS))
+    check_number("scale", scale, "(0, 100]")
     samples = max(1, round(scale * _SAMPLES.get(problem, _MORE_SAMPLES)))
     common = PolicyIterationConfig(samples_per_part=samples, value_samples=samples, seed=seed)
     if settings == "tuned":
@@ -130,13 +163,15 @@ def plan(
     """The training runs of an experiment by name.
 
     Raises:
-        ValueError: if a problem is not one of the experiment's.
+        TypeError: if something is of the wrong kind.
+        ValueError: if a number is out of range, a name is unknown, or a problem is not one of the experiment's.
 
     Examples:
         >>> list(plan(EXPERIMENTS["ablation"], "paper", "greedy", 0.1, seed=0))
         ['linear20-pAPI-NT-paper-greedy-scale0.1-seed0', 'linear20-pAPI-T-paper-greedy-scale0.1-seed0']
     """
-    unknown = [problem for problem in problems if problem not in experiment.problems]
+    check_instance("experiment", experiment, Experiment)
+    unknown = [problem for problem in check_sequence("problems", problems, str) if problem not in experiment.problems]
     if unknown:
         raise ValueError(f"problems must be among {experiment.problems} for {experiment.name}, got {unknown[0]!r}")
     runs = {}
@@ -166,10 +201,11 @@ def reproduce(
     base: Literal["greedy", "urgency"] = "greedy",
     problems: Sequence[str] = (),
     seed: int = 0,
-    runs: Path = Path("runs"),
-    out: Path = Path("results"),
+    runs: str | PathLike[str] = Path("runs"),
+    out: str | PathLike[str] = Path("results"),
     device: torch.device | str = "cpu",
     report: Callable[[str, str, Comparison], None] = lambda run, policy, comparison: None,
+    tell: Callable[[str], None] = lambda text: None,
     progress: bool = False,
 ) -> str:
     """Carry out an experiment, or go on with an interrupted one, and write numbers, a table and figures.
@@ -187,21 +223,30 @@ def reproduce(
         out: folder of the results, ``NAME.json``, ``NAME.md`` and ``NAME-*.png``.
         device: where to compute.
         report: called with run, policy and its comparison with greedy as soon as it is known.
-        progress: whether to show progress; the outer bar counts labelled states and estimates the time left.
+        tell: called with the table before pictures are drawn, then with a line that says where they are or why there are
+            none.
+        progress: whether to show progress on a terminal; the outer bar counts labelled states and estimates the time left.
 
     Returns:
         the table, Markdown.
 
     Raises:
-        ValueError: if ``scale`` is not positive or a problem is not one of the experiment's.
+        TypeError: if something is of the wrong kind.
+        ValueError: if a number is out of range, a problem is not one of the experiment's, a folder cannot be written or holds
+            something else, or there is no such device; before anything is computed.
     """
+    check_flag("progress", progress)
+    check_callable("report", report)
+    check_callable("tell", tell)
+    device = check_device("device", device)
+    runs, out = check_folder("runs", runs), check_folder("out", out)
     planned = plan(experiment, settings, base, scale, seed, problems)
     results: dict[str, dict[str, Comparison]] = {}
     iterations: dict[str, list[dict[str, Any]]] = {}
     costs: dict[str, dict[str, Tensor]] = {}
     total = sum(run.config.iterations * _iteration_labels(run) for run in planned.values())
     # An average rate over the whole run, since labelling and training take turns.
-    with tqdm(total=total, unit="label", desc=experiment.name, smoothing=0, disable=not progress) as bar:
+    with progress_bar(total, "label", experiment.name, progress, smoothing=0, leave=True) as bar:
         for name, run in planned.items():
             results[name] = run.carry_out(
                 runs / name,
@@ -217,7 +262,10 @@ def reproduce(
         title = f"{title}-{'-'.join(problems)}"
     about = {"experiment": experiment.name, "settings": settings, "base": base, "scale": scale, "seed": seed}
     paired = {problem: paired_ratios(found) for problem, found in costs.items()}
-    return _write(out, title, about, planned, results, iterations, paired)
+    text = _write(out, title, about, planned, results, iterations, paired)
+    tell(text)
+    tell(draw(_figures(out, title, planned, results, iterations)))
+    return text
 
 
 def _write(
@@ -227,16 +275,17 @@ def _write(
     planned: dict[str, TrainingRun],
     results: dict[str, dict[str, Comparison]],
     iterations: dict[str, list[dict[str, Any]]],
-    paired: dict[str, dict[str, dict[str, Estimate]]],
+    paired: dict[str, dict[str, dict[str, Estimate | None]]],
 ) -> str:
-    """Write numbers, tables and figures; returns the tables."""
+    """Write numbers and tables; returns the tables."""
     content = {
         **about,
         "provenance": provenance(),
         "runs": {name: asdict(run) for name, run in planned.items()},
         "results": {name: {p: asdict(c) for p, c in found.items()} for name, found in results.items()},
         "paired": {
-            problem: {p: {r: asdict(e) for r, e in row.items()} for p, row in rows.items()} for problem, rows in paired.items()
+            problem: {p: {r: e and asdict(e) for r, e in row.items()} for p, row in rows.items()}
+            for problem, rows in paired.items()
         },
         "iterations": iterations,
     }
@@ -244,8 +293,7 @@ def _write(
     text = comparison_table({name: (run.problem, results[name]) for name, run in planned.items()})
     text += "".join(f"\n\n{paired_table(problem, rows)}" for problem, rows in paired.items())
     text += f"\n\n{effort_table({f'{run.problem}, {run.algorithm}': iterations[name] for name, run in planned.items()})}"
-    write_atomically(out / f"{title}.md", lambda path: path.write_text(text + "\n"))
-    _draw(out, title, planned, results, iterations)
+    write_bytes(out / f"{title}.md", (text + "\n").encode())
     return text
 
 
@@ -271,10 +319,9 @@ def comparison_table(results: dict[str, tuple[str, dict[str, Comparison]]]) -> s
         for policy, comparison in found.items():
             published, greedy = PUBLISHED.get((problem, policy)), PUBLISHED.get((problem, "greedy"))
             beside = f"{published} | {published / greedy:.3f}" if published and greedy else " | "
-            low, high = comparison.ratio.interval
             lines.append(
                 f"| {problem} | {policy} | {comparison.cost.count} | {interval_text(comparison.cost)} | "
-                f"{comparison.ratio.mean:.3f} | {low:.3f} … {high:.3f} | {beside} |"
+                f"{' | '.join(ratio_texts(comparison.ratio))} | {beside} |"
             )
             if known:
                 lines[-1] += f" {_over_optimum(problem, comparison)} |"
@@ -302,24 +349,23 @@ def _advance(bar: tqdm, labels: int, restored: bool) -> None:
     bar.update(labels)
 
 
-def _draw(
+def _figures(
     out: Path,
     title: str,
     planned: dict[str, TrainingRun],
     results: dict[str, dict[str, Comparison]],
     iterations: dict[str, list[dict[str, Any]]],
-) -> None:
-    """Bars for each run, cost against iteration, and training time by part."""
-    for name, run in planned.items():
-        bars = [Result(policy, comparison) for policy, comparison in results[name].items()]
-        figure = cost_figure(bars, f"{name}; below each policy its ratio to greedy")
-        write_atomically(out / f"{title}-{run.problem}-{run.algorithm}.png", figure.savefig)
+) -> dict[Path, Callable[[], Figure]]:
+    """Bars for each run, cost against iteration, and training time by part; drawn when they are called."""
+    figures: dict[Path, Callable[[], Figure]] = {}
     lines = {}
     for name, run in planned.items():
-        found = results[name]
-        lines[f"{run.problem}, {run.algorithm}"] = [found[run.base]] + [
-            found[policy] for policy in found if is_iteration(policy)
-        ]
-    write_atomically(out / f"{title}-iterations.png", iteration_figure(lines).savefig)
+        found, label = results[name], f"{run.problem}, {run.algorithm}"
+        bars = [Result(policy, comparison) for policy, comparison in found.items()]
+        path = out / f"{title}-{run.problem}-{run.algorithm}.png"
+        figures[path] = partial(cost_figure, bars, f"{name}; below each policy its ratio to greedy")
+        lines[label] = [found[run.base]] + [found[policy] for policy in found if is_iteration(policy)]
     times = {f"{run.problem}, {run.algorithm}": iterations[name] for name, run in planned.items()}
-    write_atomically(out / f"{title}-time.png", time_figure(times).savefig)
+    figures[out / f"{title}-iterations.png"] = partial(iteration_figure, lines)
+    figures[out / f"{title}-time.png"] = partial(time_figure, times)
+    return figures

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from _oracles import random_states, small_model
@@ -42,6 +44,15 @@ def test_every_state_is_in_the_one_part_that_the_definition_gives(seed, case):
     parts = RepairPartition(graph, model.costs)(y)
     for row in range(20):
         assert parts[row] == part_by_hand(graph, model.costs, y["belief"][row], y["location"][row].tolist())
+
+
+def test_sides_do_not_depend_on_the_unit_of_the_columns(linear20):
+    y = random_states(small_model(line(9), 2), 200, 0)
+    costs = torch.tensor([0.0, 1.0, 5.0])
+    plain = RepairPartition(line(9), costs)(y)
+    for scale, shift in ((0.1, 0.0), (0.37, 5.1), (431.7, -90.3)):
+        pipe = dataclasses.replace(line(9), columns=line(9).columns * scale + shift)
+        assert torch.equal(RepairPartition(pipe, costs)(y), plain)
 
 
 def test_no_damage_on_either_side_is_balanced():

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import time
+from itertools import permutations
+
 import pytest
 import torch
 from _oracles import random_states, small_model
@@ -49,6 +53,61 @@ def test_no_two_are_the_same_and_the_identity_comes_first():
 def test_graphs_without_a_plan_have_only_what_their_edges_allow():
     fork = Graph.from_edges("fork", 4, [(0, 1), (1, 2), (1, 3)])
     assert len(symmetries(small_model(fork))) == 1
+
+
+def by_trying(graph):
+    """Slot maps by trying all permutations: the first one that keeps the graph, for every map of locations."""
+    table, size = graph.neighbours.tolist(), graph.num_locations
+    found = set()
+    for renamed in permutations(range(size)):
+        for slots in permutations(range(len(graph.slot_names))):
+            kept = (
+                table[renamed[n]][slots[s]] == (renamed[t] if t >= 0 else -1)
+                for n in range(size)
+                for s, t in enumerate(table[n])
+            )
+            if all(kept):
+                found.add((renamed, slots))
+                break
+    return found
+
+
+RING = Graph.from_slots("ring", [[1, 3], [2, 0], [3, 1], [0, 2]], ("on", "back"), [0, 1, 1, 0], [0, 0, 1, 1])
+
+
+@pytest.mark.parametrize("graph", [line(1), line(4), grid(2, 2), grid(3, 2), grid(1, 3), RING])
+def test_slot_maps_are_those_found_by_trying(graph):
+    tried = by_trying(graph)
+    found = [(tuple(s.locations.tolist()), tuple((s.controls[1:] - 1).tolist())) for s in symmetries(small_model(graph))]
+    assert set(found) <= tried
+    assert found[0] == (tuple(range(graph.num_locations)), tuple(range(len(graph.slot_names))))
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(0.4, 0.0), (0.1, 7.3), (210.7, 1000.9)])
+@pytest.mark.parametrize(("graph", "count"), [(line(5), 2), (grid(3, 2), 4), (grid(4, 4), 8)])
+def test_coordinates_may_be_in_metres(graph, count, scale, shift):
+    moved = dataclasses.replace(graph, columns=graph.columns * scale + shift, rows=graph.rows * scale - shift)
+    found, expected = symmetries(small_model(moved)), symmetries(small_model(graph))
+    assert len(found) == count
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one.locations, other.locations)
+        assert torch.equal(one.controls, other.controls)
+
+
+def test_any_degree_and_number_of_robots_is_quick():
+    hub = Graph.from_edges("hub", 13, [(0, arm) for arm in range(1, 13)])
+    plus = Graph.from_slots(
+        "plus",
+        [[1, 2, 3, 4], [-1, 0, -1, -1], [0, -1, -1, -1], [-1, -1, -1, 0], [-1, -1, 0, -1]],
+        ("left", "right", "up", "down"),
+        [0, -1, 1, 0, 0],
+        [0, 0, 0, -1, 1],
+    )
+    began = time.perf_counter()
+    assert len(symmetries(small_model(hub))) == 1
+    assert len(symmetries(small_model(plus))) == 8
+    assert len(symmetries(small_model(line(2), num_robots=6))) == 240
+    assert time.perf_counter() - began < 5
 
 
 def test_images_of_labels_are_labels_of_images():

@@ -13,7 +13,10 @@ from torch._inductor import config as inductor_config
 
 from torchrl_pomdp.envs import CalibratedStart, RepairModel, damage_chain, line, tiger
 from torchrl_pomdp.modules import (
+    AfterSteps,
     GreedyRepair,
+    NeverRepairCost,
+    OnEntering,
     PartitionedPolicy,
     PolicyNetwork,
     RelativeEncoder,
@@ -70,14 +73,15 @@ def test_labels_can_be_trained_on(linear20):
     assert weight.grad is not None
 
 
-def test_compiled_and_eager_agree(linear20):
-    keys = torch.arange(300)
-    y = linear20.start(keys)
-    greedy = GreedyRepair(linear20.model)
+def test_compiled_and_eager_agree(line3):
+    """All that a step may hold: the stratified observations of several trajectories, and a rule that reads the part."""
+    model, y = line3.model, line3.start(torch.arange(30))
+    rule = {"truncation": OnEntering((3, 4, 5)) | AfterSteps(40), "terminal_cost": NeverRepairCost(model)}
+    options = {"trajectories": 3, "chunk_rows": 100, **rule}
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="compile=True")
-        fast = TruncatedRollout(linear20.model, greedy, compile=True, chunk_rows=100)(y, keys)
-    torch.testing.assert_close(fast, TruncatedRollout(linear20.model, greedy)(y, keys), rtol=1e-5, atol=1e-3)
+        fast = RolloutPolicy(model, GreedyRepair(model), compile=True, **options).q_factors(y)
+    torch.testing.assert_close(fast, RolloutPolicy(model, GreedyRepair(model), **options).q_factors(y), rtol=1e-5, atol=1e-3)
 
 
 def test_without_a_compiler_it_runs_as_it_is(line3):

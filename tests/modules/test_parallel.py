@@ -12,7 +12,7 @@ def test_q_factors_are_the_smallest_over_the_bases(linear20):
     model = linear20.model
     rollouts = [RolloutPolicy(model, base(model), trajectories=4) for base in (GreedyRepair, UrgencyRepair)]
     parallel = ParallelRollout(rollouts)
-    y = linear20.start(torch.arange(30))
+    y = linear20.start(torch.arange(60))
     q = parallel(y.copy())["q_factors"]
     each = [rollout(y.copy())["q_factors"] for rollout in rollouts]
     assert torch.equal(q, torch.minimum(*each))

@@ -81,8 +81,8 @@ def test_realised_costs_with_independent_noise_make_rollout_worse_than_greedy(li
     """Why the stage cost is the expectation and the controls share their noise: without both, rollout is ruined."""
     model, greedy = linear20.model, GreedyRepair(linear20.model)
     naive = _NaiveRollout(model, greedy, trajectories=10)
-    baseline = discounted_costs(model, greedy, linear20.start, num_states=24)
-    comparison = compare(discounted_costs(model, naive, linear20.start, num_states=24), baseline)
+    baseline = discounted_costs(model, greedy, linear20.start, num_states=12)
+    comparison = compare(discounted_costs(model, naive, linear20.start, num_states=12), baseline)
     assert comparison.difference.interval[0] > 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import pytest
 import torch
@@ -268,16 +267,6 @@ def test_the_rollout_policy_passes_the_rule_on(line3):
     torch.testing.assert_close(q[legal], (stage + line3.model.discount * 7).expand_as(q)[legal])
 
 
-def test_compiled_and_eager_agree_with_a_rule():
-    model = small_model(partition=Countdown())
-    y, keys, greedy = random_states(model, 100, seed=5), torch.arange(100), GreedyRepair(model)
-    options = {"truncation": OnEntering((1,)) | AfterSteps(4), "terminal_cost": damage, "chunk_rows": 32}
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="compile=True")
-        fast = TruncatedRollout(model, greedy, compile=True, **options)(y, keys)
-    torch.testing.assert_close(fast, TruncatedRollout(model, greedy, **options)(y, keys))
-
-
 def test_rules_of_several_robots_and_of_the_papers_partition():
     graph, costs = line(6), (0.0, 1.0, 5.0)
     model = RepairModel(
@@ -301,11 +290,11 @@ def test_rules_of_several_robots_and_of_the_papers_partition():
 
 def test_bad_rules_are_refused(linear20):
     model, greedy = linear20.model, GreedyRepair(linear20.model)
-    with pytest.raises(ValueError, match="m must be at least 0, got -1"):
+    with pytest.raises(ValueError, match="m must be an integer of at least 0, got -1"):
         AfterSteps(-1)
     with pytest.raises(ValueError, match="parts must hold at least one part"):
         OnEntering(())
-    with pytest.raises(ValueError, match=r"none below 0, got \(-1, 2\)"):
+    with pytest.raises(ValueError, match=r"parts must be an integer of at least 0, got -1"):
         OnEntering((2, -1))
     with pytest.raises(ValueError, match="truncation needs a terminal_cost"):
         TruncatedRollout(model, greedy, truncation=AfterSteps(3))

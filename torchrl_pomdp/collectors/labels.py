@@ -11,14 +11,17 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.collectors import Collector
 from tqdm import tqdm
 
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_path, check_text, shown
 from torchrl_pomdp.collectors.states import StateSampler
-from torchrl_pomdp.envs.belief import BeliefEnv
-from torchrl_pomdp.files import load_tensors, save_tensors
-from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.envs.belief_env import BeliefEnv
+from torchrl_pomdp.identity import digest
+from torchrl_pomdp.kept import keep, kept
+from torchrl_pomdp.modules.rollout import Policy, controls_of
+from torchrl_pomdp.progress import progress_bar
 
 __all__ = ["LabelCollector", "OnLabels"]
 
@@ -28,6 +31,8 @@ OnLabels = Callable[[int, bool], None]
 # States that are drawn, labelled and kept at once; the data do not depend on it. Many, because a rollout is slow at its end,
 # when few trajectories are left.
 _BLOCK = 16384
+# Most states of a batch, which is kept in memory.
+_LARGEST = 10**9
 
 
 class LabelCollector(Collector):
@@ -52,7 +57,7 @@ class LabelCollector(Collector):
         total_frames: labelled states in all; -1 for no end.
         num_workers: number of collectors that share the work; this one is number ``worker_idx``.
         cache: folder for labelled blocks; those that an interrupted run has left there are read instead of being labelled
-            again. It must belong to this run alone. None keeps nothing.
+            again, unless they are damaged or another run's. None keeps nothing.
         progress: whether to show a progress bar with the labelling rate.
         name: what the progress bar calls the work.
         on_labels: called after every block with its number of states and whether they were read from the cache.
@@ -63,8 +68,8 @@ class LabelCollector(Collector):
         seconds: time that they and drawing the states took.
 
     Raises:
-        TypeError: if the environment is not a :class:`BeliefEnv`.
-        ValueError: if ``num_workers`` is not positive.
+        TypeError: if an argument is of the wrong kind, or the environment is not a :class:`BeliefEnv`.
+        ValueError: if a number is not positive.
     """
 
     def __init__(
@@ -83,25 +88,34 @@ class LabelCollector(Collector):
         on_labels: OnLabels | None = None,
         **kwargs: Any,
     ) -> None:
-        if num_workers < 1:
-            raise ValueError(f"num_workers must be at least 1, got {num_workers}")
+        # A worker of several is given a factory instead.
+        if kwargs.get("policy_factory") is None:
+            check_callable("policy", policy)
+        self.states, self.num_workers = check_callable("states", states), check_integer("num_workers", num_workers, 1)
+        check_callable("label", label)
+        frames_per_batch = check_integer("frames_per_batch", frames_per_batch, 1, _LARGEST)
+        if check_integer("total_frames", total_frames, -1) == 0:
+            raise ValueError("total_frames must be a positive integer, or -1 for no end, got 0")
+        self.cache = None if cache is None else check_path("cache", cache)
+        self.progress, self.name = check_flag("progress", progress), check_text("name", name)
+        self.on_labels = None if on_labels is None else check_callable("on_labels", on_labels)
         # The data is no environment rollout: buffers of that layout and transforms for it do not apply.
         kwargs["use_buffers"] = False
         kwargs["auto_register_policy_transforms"] = False
         # Any callable on feature states is a policy; TorchRL would map its arguments to entries.
         kwargs["trust_policy"] = True
+        env = _environment(create_env_fn)
+        if policy is not None:
+            first = env.model.with_features(env.model.drawn(self.states, torch.zeros(1, dtype=torch.int64, device=env.device)))
+            env.model.check_controls(first, controls_of("policy", policy, first.copy()))
         super().__init__(
-            create_env_fn,
+            env,
             copy.deepcopy(policy),
             frames_per_batch=frames_per_batch,
             total_frames=total_frames,
             **kwargs,
         )
-        if not isinstance(self.env, BeliefEnv):
-            raise TypeError(f"create_env_fn must give a BeliefEnv, got {type(self.env).__name__}")
-        self.states, self.num_workers, self.cache, self.progress, self.name = states, num_workers, cache, progress, name
-        self.on_labels = on_labels
-        self.labeller = label(self.env.model, self.policy)
+        self.labeller = check_instance("label(model, policy)", label(self.env.model, self.policy), TensorDictModuleBase)
         self._batches, self.simulated_steps, self.seconds = 0, 0, 0.0
 
     @torch.no_grad()
@@ -112,35 +126,37 @@ class LabelCollector(Collector):
         first = (self._batches * self.num_workers + (self.worker_idx or 0)) * size
         self._batches += 1
         index = torch.arange(first, first + size, device=self.env.device)
-        with tqdm(total=size, unit="state", desc=self.name, disable=not self.progress, leave=False) as bar:
-            blocks = [self._block(numbers, bar) for numbers in index.split(_BLOCK)]
+        owner = "" if self.cache is None else digest([self.labeller, self.states])
+        with progress_bar(size, "state", self.name, self.progress) as bar:
+            blocks = [self._block(numbers, owner, bar) for numbers in index.split(_BLOCK)]
         batch: Any = torch.cat(blocks, 0)
         batch.set(("collector", "traj_ids"), index)
         return batch.set(("collector", "mask"), torch.ones_like(index, dtype=torch.bool))
 
-    def _block(self, numbers: Tensor, bar: tqdm) -> TensorDictBase:
-        """Labelled states with the given numbers ``[N]``, from the cache where they are there."""
+    def _block(self, numbers: Tensor, owner: str, bar: tqdm) -> TensorDictBase:
+        """Labelled states with the given numbers ``[N]``, from the cache where ``owner`` has made them."""
         path = self.cache / f"{int(numbers[0]):012d}-{numbers.numel()}.pt" if self.cache is not None else None
-        if path is not None and path.is_file():
-            content = load_tensors(path, self.env.device)
-            self.simulated_steps += content["simulated_steps"]
-            self.seconds += content["seconds"]
-            self._advance(bar, numbers.numel(), cached=True)
-            return TensorDict(content["states"], numbers.shape, device=self.env.device)
-        before, begin = self.labeller.simulated_steps, time.perf_counter()
-        block = self.labeller(self.env.model.with_features(self.states(numbers)))
-        steps, seconds = self.labeller.simulated_steps - before, time.perf_counter() - begin
-        self.simulated_steps += steps
-        self.seconds += seconds
-        self._advance(bar, numbers.numel(), cached=False)
-        if path is not None:
-            save_tensors(path, {"states": block.to_dict(), "simulated_steps": steps, "seconds": seconds})
-        return block
-
-    def _advance(self, bar: tqdm, states: int, *, cached: bool) -> None:
-        bar.update(states)
+        owner = f"{owner} {path.name}" if path is not None else owner
+        content = kept(path, owner, self.env.device) if path is not None else None
+        cached = content is not None
+        if content is None:
+            content = self._label(numbers)
+            if path is not None:
+                keep(path, owner, content)
+        self.simulated_steps += content["simulated_steps"]
+        self.seconds += content["seconds"]
+        bar.update(numbers.numel())
         if self.on_labels is not None:
-            self.on_labels(states, cached)
+            self.on_labels(numbers.numel(), cached)
+        return TensorDict(content["states"], numbers.shape, device=self.env.device)
+
+    def _label(self, numbers: Tensor) -> dict[str, Any]:
+        """Labelled states with the given numbers ``[N]``, and what they took."""
+        before, begin = self.labeller.simulated_steps, time.perf_counter()
+        model = self.env.model
+        block = self.labeller(model.with_features(model.drawn(self.states, numbers)))
+        steps, seconds = self.labeller.simulated_steps - before, time.perf_counter() - begin
+        return {"states": block.to_dict(), "simulated_steps": steps, "seconds": seconds}
 
     def state_dict(self) -> dict[str, Any]:
         """State of the base policy and the number of batches made."""
@@ -151,3 +167,12 @@ class LabelCollector(Collector):
         state = dict(state_dict)
         self._batches = state.pop("batches")
         super().load_state_dict(state, **kwargs)
+
+
+def _environment(create_env_fn: Any) -> BeliefEnv:
+    """The environment of a collector."""
+    makes = callable(create_env_fn) and not isinstance(create_env_fn, (nn.Module, type))
+    env = create_env_fn() if makes else create_env_fn
+    if not isinstance(env, BeliefEnv):
+        raise TypeError(f"create_env_fn must be a BeliefEnv or a function that makes one, got {shown(env)}")
+    return env

@@ -9,8 +9,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_keys, check_number
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf, take_rows
-from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, controls_of
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.noise import fold, uniform
 
@@ -35,6 +36,7 @@ class StateMemory:
         seed: seed of the sample.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if ``capacity`` is not positive or ``retain`` is not in (0, 1].
 
     Examples:
@@ -48,11 +50,10 @@ class StateMemory:
     """
 
     def __init__(self, model: BeliefModel, capacity: int = 100_000, retain: float = 0.1, seed: int = 0) -> None:
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1, got {capacity}")
-        if not 0.0 < retain <= 1.0:
-            raise ValueError(f"retain must be in (0, 1], got {retain}")
-        self.model, self.capacity, self.retain, self.seed = model, capacity, retain, seed
+        self.model = check_instance("model", model, BeliefModel)
+        self.capacity = check_integer("capacity", capacity, 1)
+        self.retain = check_number("retain", retain, "(0, 1]")
+        self.seed = check_integer("seed", seed)
         parts = 1 if model.partition is None else model.partition.num_parts
         # For each part the states (core entries) and their priorities, ascending.
         self._kept: list[tuple[TensorDictBase, Tensor] | None] = [None] * parts
@@ -60,9 +61,13 @@ class StateMemory:
         self._pending: list[TensorDictBase] = []
 
     def count(self, part: int) -> int:
-        """Number of states of a part."""
-        self._merge()
-        kept = self._kept[part]
+        """Number of states of a part.
+
+        Raises:
+            TypeError: if ``part`` is no integer.
+            ValueError: if there is no such part.
+        """
+        kept = self._states_of(part)
         return 0 if kept is None else kept[1].numel()
 
     @torch.no_grad()
@@ -81,23 +86,29 @@ class StateMemory:
             max_steps: length at which trajectories are cut.
 
         Raises:
-            ValueError: if ``exploration`` is not in [0, 1] or ``max_steps`` is not positive.
+            TypeError: if an argument is of the wrong kind.
+            ValueError: if ``exploration`` is not in [0, 1], ``max_steps`` is not positive, a start state does not fit the
+                model or a control of the policy is illegal.
         """
-        if not 0.0 <= exploration <= 1.0:
-            raise ValueError(f"exploration must be in [0, 1], got {exploration}")
-        if max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+        check_callable("policy", policy)
+        check_callable("start", start)
+        exploration = check_number("exploration", exploration, "[0, 1]")
+        max_steps = check_integer("max_steps", max_steps, 1, MAX_STEPS)
+        if check_keys("keys", keys).ndim != 1:
+            raise ValueError(f"keys must have shape [N], got {tuple(keys.shape)}")
         for block in keys.split(_BLOCK):
-            self._add(torch.cat([*self._walk(policy, start, block, exploration, max_steps)], 0))
+            visited: list[Any] = list(self._walk(policy, start, block, exploration, max_steps))
+            if visited:
+                self._add(torch.cat(visited, 0))
 
     def generator(self, part: int) -> StateGenerator:
         """Generator of the states of a part that are kept now, all equally likely.
 
         Raises:
-            ValueError: if there are none.
+            TypeError: if ``part`` is no integer.
+            ValueError: if there are none, or there is no such part.
         """
-        self._merge()
-        kept = self._kept[part]
+        kept = self._states_of(part)
         if kept is None:
             raise ValueError(f"the memory holds no state of part {part}")
         states = kept[0]
@@ -109,12 +120,16 @@ class StateMemory:
 
         return draw
 
+    def _states_of(self, part: int) -> tuple[TensorDictBase, Tensor] | None:
+        self._merge()
+        return self._kept[check_integer("part", part, 0, len(self._kept) - 1)]
+
     def _walk(
         self, policy: Policy, start: StateGenerator, keys: Tensor, exploration: float, max_steps: int
     ) -> Iterator[TensorDictBase]:
         """The retained states of every step of the trajectories with the given keys."""
         model = self.model
-        y = model.with_features(start(fold(keys, _START)))
+        y = model.with_features(model.drawn(start, fold(keys, _START)))
         scenarios = Scenarios.single(fold(keys, _STEPS))
         for step in range(max_steps):
             rest = (~model.is_terminal(y)).nonzero().squeeze(-1)
@@ -123,7 +138,8 @@ class StateMemory:
             if keys.numel() == 0:
                 return
             yield self._retained(y)
-            u = policy(y.copy()).get("action")
+            u = controls_of("policy", policy, y.copy())
+            model.check_controls(y, u)
             random = inverse_cdf(y.get("action_mask").to(torch.float32), uniform(fold(keys, _CONTROL), step))
             u = torch.where(uniform(fold(keys, _EXPLORE), step) < exploration, random, u)
             noise, scenarios = scenarios.draw(torch.full_like(keys, step), model.observed(y, u), 1)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_keys, check_number, shown
 from torchrl_pomdp.collectors.memory import StateMemory
 from torchrl_pomdp.envs.belief import StateGenerator
 from torchrl_pomdp.envs.generators import Mixture, draw_each
@@ -27,6 +28,7 @@ class PartSampler:
         seed: seed of the states.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if there is no generator.
 
     Examples:
@@ -39,12 +41,18 @@ class PartSampler:
     """
 
     def __init__(self, generators: Mapping[int, StateGenerator], seed: int) -> None:
+        if not isinstance(generators, Mapping):
+            raise TypeError(f"generators must map parts to generators, got {shown(generators)}")
         if not generators:
             raise ValueError("generators is empty: give a generator for at least one part")
-        self.generators, self.seed = dict(generators), seed
+        for part, generator in generators.items():
+            check_callable(f"generators[{check_integer('generators', part, 0)}]", generator)
+        self.generators, self.seed = dict(generators), check_integer("seed", seed)
 
     def __call__(self, index: Tensor) -> TensorDictBase:
         """Feature states ``[N]`` with the numbers ``index``, int64 ``[N]``."""
+        if check_keys("index", index).ndim != 1:
+            raise ValueError(f"index must have shape [N], got {tuple(index.shape)}")
         keys = seed_keys(self.seed, index)
         which = index % len(self.generators)
         return draw_each(list(self.generators.values()), which, keys)
@@ -62,7 +70,8 @@ def training_states(problem: Problem, memory: StateMemory | None, part: int, *, 
         visited_share: share of visited states, in [0, 1]; where the memory holds none of the part, all are random.
 
     Raises:
-        ValueError: if ``visited_share`` is out of range.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if ``visited_share`` is out of range or there is no such part.
 
     Examples:
         >>> import torch
@@ -75,9 +84,11 @@ def training_states(problem: Problem, memory: StateMemory | None, part: int, *, 
         >>> problem.model.partition(y).unique().tolist()
         [4]
     """
-    if not 0.0 <= visited_share <= 1.0:
-        raise ValueError(f"visited_share must be in [0, 1], got {visited_share}")
-    random = problem.training[part]
+    check_instance("problem", problem, Problem)
+    if memory is not None:
+        check_instance("memory", memory, StateMemory)
+    visited_share = check_number("visited_share", visited_share, "[0, 1]")
+    random = problem.training[check_integer("part", part, 0, len(problem.training) - 1)]
     if memory is None or memory.count(part) == 0:
         return random
     return Mixture([random, memory.generator(part)], [1.0 - visited_share, visited_share])

@@ -1,7 +1,7 @@
-"""The belief model, the paper's Section II as code, and its TorchRL environment.
+"""The belief model, the paper's Section II as code.
 
 A :class:`BeliefModel` is a set of pure, batched functions of the feature state ``y``. Planners call the model; users and
-TorchRL call :class:`BeliefEnv`, a thin skin over it.
+TorchRL call :class:`~torchrl_pomdp.envs.BeliefEnv`, a thin skin over it.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Binary, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec
 
+from torchrl_pomdp.checks import check_callable, check_instance, check_keys, check_number, shown
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.noise import fingerprint
 
-__all__ = ["BeliefEnv", "BeliefModel", "StateGenerator", "inverse_cdf", "put_rows", "take_rows"]
+__all__ = ["BeliefModel", "StateGenerator", "inverse_cdf", "put_rows", "take_rows"]
 
 StateGenerator = Callable[[Tensor], TensorDictBase]
 """Distribution of feature states: maps int64 keys ``[*B]`` to feature states ``[*B]``, the same key to the same state."""
@@ -110,7 +110,14 @@ class BeliefModel(nn.Module, ABC):
         discount: :math:`\alpha` in (0, 1).
         partition: the partition whose part index is a feature, or None.
 
+    A model stays on the device and in the type it was built with; ``to``, ``double`` and the like are refused.
+
+    Args:
+        discount: :math:`\alpha` in (0, 1).
+        partition: the partition whose part index is a feature, or None.
+
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if ``discount`` is not in (0, 1).
     """
 
@@ -121,10 +128,22 @@ class BeliefModel(nn.Module, ABC):
 
     def __init__(self, discount: float, partition: Partition | None = None) -> None:
         super().__init__()
-        if not 0.0 < discount < 1.0:
-            raise ValueError(f"discount must be in (0, 1), got {discount}")
-        self.discount = float(discount)
+        self.discount = check_number("discount", discount, "(0, 1)")
+        if partition is not None:
+            check_instance("partition", partition, Partition).check()
         self.partition = partition
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> BeliefModel:
+        """Refuse what would move or convert tensors: tables that are no buffers would stay behind."""
+        for dtype in (self.dtype, torch.int64):
+            probe = torch.ones(1, dtype=dtype, device=self.device)
+            result = fn(probe)
+            if result is not probe:
+                what = f"on {result.device}" if result.device != probe.device else f"with dtype {result.dtype}"
+                raise ValueError(
+                    f"a model stays on its device {self.device} and in its type {self.dtype}; build the model {what}"
+                )
+        return super()._apply(fn, recurse)
 
     @property
     @abstractmethod
@@ -222,12 +241,13 @@ class BeliefModel(nn.Module, ABC):
     def check_state(self, y: TensorDictBase) -> None:
         """Raise unless ``y`` is a feature state of this model.
 
+        Bounds may be passed by the rounding of a few operations.
+
         Raises:
             TypeError: if ``y`` is not a TensorDict or an entry has the wrong dtype.
             ValueError: if an entry is missing, has the wrong shape, or lies outside its bounds.
         """
-        if not isinstance(y, TensorDictBase):
-            raise TypeError(f"y must be a TensorDict, got {type(y).__name__}")
+        check_instance("y", y, TensorDictBase)
         for key, leaf in self.state_spec().items():
             value = y.get(key, None)
             if value is None:
@@ -240,8 +260,77 @@ class BeliefModel(nn.Module, ABC):
                 )
             if value.dtype != leaf.dtype:
                 raise TypeError(f"entry {key!r} of y has dtype {value.dtype}, expected {leaf.dtype}")
-            if value.numel() and not leaf.expand(shape).is_in(value):
+            if value.numel() and not _within(leaf, value):
                 raise ValueError(f"entry {key!r} of y holds values outside its bounds: expected {leaf}")
+
+    def check_controls(self, y: TensorDictBase, u: Tensor) -> None:
+        """Raise unless ``u`` are legal controls in ``y``; its ``"action_mask"`` is believed if it has one.
+
+        Args:
+            y: feature states ``[*B]``.
+            u: controls, int64 ``[*B]``.
+
+        Raises:
+            TypeError: if ``u`` is no tensor.
+            ValueError: if its type or shape is another, or a control is illegal; the message lists the legal ones.
+        """
+        _check_index("action", u, y.batch_size)
+        mask = y.get("action_mask", None)
+        mask = self.action_mask(y) if mask is None else mask
+        low, high = u.aminmax() if u.numel() else (0, 0)
+        if low >= 0 and high < self.num_controls and mask.gather(-1, u.unsqueeze(-1)).all():
+            return
+        known = (u >= 0) & (u < self.num_controls)
+        index = u.clamp(0, self.num_controls - 1).unsqueeze(-1)
+        where = (~(known & mask.gather(-1, index).squeeze(-1))).nonzero()[0].tolist()
+        raise ValueError(
+            f"action {int(u[tuple(where)])} at batch index {tuple(where)} is illegal; "
+            f"legal there: {mask[tuple(where)].nonzero().flatten().tolist()}"
+        )
+
+    def check_observations(self, y: TensorDictBase, z: Tensor) -> None:
+        """Raise unless ``z`` ``[*B]`` are observations of this model, whether possible in ``y`` ``[*B]`` or not.
+
+        Raises:
+            TypeError: if ``z`` is no tensor.
+            ValueError: if its type or shape is another, or a number is out of range.
+        """
+        _check_index("observation", z, y.batch_size)
+        if z.numel():
+            low, high = z.aminmax()
+            if low < 0 or high >= self.num_observations:
+                raise ValueError(
+                    f"observation must be in 0..{self.num_observations - 1}, got {int(low if low < 0 else high)} among them"
+                )
+
+    def _refuse_impossible(self, z: Tensor, possible: Tensor) -> None:
+        """Raise if an observation of ``z`` ``[*B]`` is not ``possible`` ``[*B]`` (helper for subclasses)."""
+        if not possible.all():
+            where = tuple((~possible).nonzero()[0].tolist())
+            raise ValueError(f"observation {int(z[where])} at batch index {where} is impossible after this control")
+
+    def drawn(self, generator: StateGenerator, keys: Tensor) -> TensorDictBase:
+        """The feature states ``[*B]`` that a generator gives for int64 keys ``[*B]``, checked.
+
+        Core entries come to the model's device and, where they are floating, to its type.
+
+        Raises:
+            TypeError: if the generator gives no TensorDict, or an entry of the wrong kind.
+            ValueError: if it gives another batch than the keys', or what is no feature state of this model.
+
+        Examples:
+            >>> from torchrl_pomdp.envs import FixedBelief, tiger
+            >>> tiger().drawn(FixedBelief(torch.tensor([0.5, 0.5])), torch.arange(3))["belief"].shape
+            torch.Size([3, 2])
+        """
+        y = generated(generator, keys)
+        result = TensorDict(dict(y.items()), batch_size=y.batch_size, device=self.device)
+        for key in self.state_keys:
+            leaf = result.get(key, None)
+            if isinstance(leaf, Tensor) and leaf.is_floating_point():
+                result.set(key, leaf.to(self.dtype))
+        self.check_state(result)
+        return result
 
     def describe(self) -> str:
         """One line: what the model is, with the numbers of controls and observations."""
@@ -251,137 +340,28 @@ class BeliefModel(nn.Module, ABC):
         )
 
 
-class BeliefEnv(EnvBase):
-    r"""TorchRL environment over a belief model; ``reward`` is minus the expected stage cost :math:`\hat g`.
+def generated(generator: StateGenerator, keys: Tensor) -> TensorDictBase:
+    """What a generator gives for int64 keys ``[*B]``: raises unless it is a TensorDict ``[*B]``."""
+    check_callable("generator", generator)
+    y = generator(check_keys("keys", keys))
+    if not isinstance(y, TensorDictBase):
+        raise TypeError(f"generator must give a TensorDict of feature states, got {shown(y)}")
+    if y.batch_size != keys.shape:
+        raise ValueError(f"generator must give one state for each key, {tuple(keys.shape)}, got batch {tuple(y.batch_size)}")
+    return y
 
-    The batch is free by default (``batch_size=()``, any TensorDict batch is accepted) or fixed. Legal controls are in
-    ``"action_mask"``; :meth:`rand_action` obeys it. An illegal control raises. States enter through
-    ``reset(y, set_state=True)``, which computes the mask and ``"terminated"``; ``step`` reads them.
 
-    ============== ============ ==========================================
-    key            shape        meaning
-    ============== ============ ==========================================
-    core entries   ``[*B, …]``  ``model.state_spec()``, e.g. ``belief``
-    action_mask    ``[*B, U]``  bool, legal controls
-    partition      ``[*B]``     int64, if the model has a partition
-    action         ``[*B]``     int64
-    reward         ``[*B, 1]``  minus the expected cost
-    terminated     ``[*B, 1]``  no cost follows
-    ============== ============ ==========================================
+def _within(leaf: TensorSpec, value: Tensor) -> bool:
+    """Whether ``value`` ``[*B, ...]`` lies in the bounds of a spec, those of floating numbers widened by a few roundings."""
+    if isinstance(leaf, Bounded) and leaf.dtype.is_floating_point:
+        low, high = leaf.space.low, leaf.space.high
+        slack = 8 * torch.finfo(leaf.dtype).eps
+        low, high = low - slack * low.abs().clamp_min(1), high + slack * high.abs().clamp_min(1)
+        return bool(value.amin() >= low.max() and value.amax() <= high.min()) or bool(((value >= low) & (value <= high)).all())
+    return bool(leaf.expand(value.shape).is_in(value))
 
-    Args:
-        model: the belief model.
-        generator: distribution of start states, maps int64 keys ``[*B]`` to feature states ``[*B]``.
 
-    Keyword Args:
-        batch_size: fixed batch, or ``()`` for a free one.
-        seed: seed of the environment's own random numbers.
-
-    Raises:
-        ValueError: by ``step`` if a control is illegal, by ``reset`` if a given state does not fit the model.
-
-    Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> problem = make_problem("linear20")
-        >>> env = BeliefEnv(problem.model, problem.start, batch_size=(4,), seed=0)
-        >>> env.rollout(3)["next", "reward"].shape
-        torch.Size([4, 3, 1])
-    """
-
-    _supports_set_state = True
-
-    def __init__(
-        self,
-        model: BeliefModel,
-        generator: StateGenerator,
-        *,
-        batch_size: torch.Size | tuple[int, ...] = (),
-        seed: int = 0,
-    ) -> None:
-        # A state that a caller sets may be terminal already.
-        super().__init__(device=model.device, batch_size=torch.Size(batch_size), allow_done_after_reset=True)
-        self.model = model
-        self.generator = generator
-        self._make_specs()
-        self.set_seed(seed)
-
-    @property
-    def batch_locked(self) -> bool:
-        """Whether the batch size is fixed."""
-        return len(self.batch_size) > 0
-
-    def _make_specs(self) -> None:
-        shape, device = self.batch_size, self.device
-        self.observation_spec = self.model.feature_spec(shape)
-        self.state_spec = self.observation_spec.clone()
-        self.action_spec = Categorical(self.model.num_controls, shape=shape, dtype=torch.int64, device=device)
-        self.reward_spec = Composite(reward=Unbounded(shape=(*shape, 1), device=device), shape=shape)
-        flags = {
-            key: Binary(1, shape=(*shape, 1), dtype=torch.bool, device=device) for key in ("done", "terminated", "truncated")
-        }
-        self.full_done_spec = Composite(flags, shape=shape, device=device)
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.rng = torch.Generator(device=self.device)
-        if seed is not None:
-            self.rng.manual_seed(seed)
-
-    def to(self, *args: Any, **kwargs: Any) -> BeliefEnv:
-        """Refused: build the model on the device and the environment over it."""
-        device = torch._C._nn._parse_to(*args, **kwargs)[0]
-        if device is None or device == self.device:
-            return self
-        raise ValueError(f"the environment lives on its model's device {self.device}; build the model on {device}")
-
-    def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
-        shape = self.batch_size if tensordict is None else tensordict.batch_size
-        if set_state and tensordict is not None:
-            self.model.check_state(tensordict)
-            y = self.model.with_features(tensordict)
-        else:
-            keys = torch.randint(-(2**62), 2**62, tuple(shape), generator=self.rng, device=self.device)
-            y = self.model.with_features(self.generator(keys))
-        return self._with_done(y)
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        u = tensordict.get("action")
-        self._check_legal(tensordict, u)
-        noise = torch.rand((*tensordict.batch_size, self.model.noise_dim), generator=self.rng, device=self.device)
-        cost, nxt = self.model.advance(tensordict, u, noise)
-        terminal = tensordict.get("terminated", None)
-        terminal = self.model.is_terminal(tensordict) if terminal is None else terminal.squeeze(-1)
-        return self._with_done(nxt).set("reward", -cost.masked_fill(terminal, 0.0).unsqueeze(-1))
-
-    def _check_legal(self, y: TensorDictBase, u: Tensor) -> None:
-        if u.shape != y.batch_size or u.dtype != torch.int64:
-            raise ValueError(f"action must be int64 of shape {tuple(y.batch_size)}, got {u.dtype} of shape {tuple(u.shape)}")
-        mask = y.get("action_mask")
-        low, high = u.aminmax() if u.numel() else (0, 0)
-        if low >= 0 and high < self.model.num_controls and mask.gather(-1, u.unsqueeze(-1)).all():
-            return
-        known = (u >= 0) & (u < self.model.num_controls)
-        index = u.clamp(0, self.model.num_controls - 1).unsqueeze(-1)
-        where = (~(known & mask.gather(-1, index).squeeze(-1))).nonzero()[0].tolist()
-        raise ValueError(
-            f"action {int(u[tuple(where)])} at batch index {tuple(where)} is illegal; "
-            f"legal there: {mask[tuple(where)].nonzero().flatten().tolist()}"
-        )
-
-    def _with_done(self, y: TensorDictBase) -> TensorDictBase:
-        terminated = self.model.is_terminal(y).unsqueeze(-1)
-        y.set("terminated", terminated)
-        y.set("done", terminated.clone())
-        y.set("truncated", torch.zeros_like(terminated))
-        return y
-
-    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """Write a uniformly random legal ``"action"``, drawn from the environment's own generator.
-
-        Args:
-            tensordict: feature states ``[*B]``; None draws for a fresh reset.
-        """
-        if tensordict is None:
-            tensordict = self.reset()
-        mask = tensordict.get("action_mask")
-        noise = torch.rand(tuple(mask.shape[:-1]), generator=self.rng, device=self.device)
-        return tensordict.set("action", inverse_cdf(mask.to(noise.dtype), noise))
+def _check_index(name: str, value: Any, shape: torch.Size) -> None:
+    check_instance(name, value, Tensor)
+    if value.shape != shape or value.dtype != torch.int64:
+        raise ValueError(f"{name} must be int64 of shape {tuple(shape)}, got {value.dtype} of shape {tuple(value.shape)}")

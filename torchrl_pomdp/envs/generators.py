@@ -12,8 +12,20 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf
+from torchrl_pomdp.checks import (
+    check_callable,
+    check_distributions,
+    check_flag,
+    check_instance,
+    check_integer,
+    check_keys,
+    check_number,
+    check_tensor,
+    shown,
+)
+from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, generated, inverse_cdf
 from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.noise import fold, uniform
 
 __all__ = ["CalibratedStart", "FixedBelief", "InPart", "Mixture", "RandomState", "UniformStart", "draw_each"]
@@ -22,6 +34,7 @@ __all__ = ["CalibratedStart", "FixedBelief", "InPart", "Mixture", "RandomState",
 _ORDER, _LEVELS, _ROBOTS, _OBSERVE, _FRACTION, _AGE, _RETRY, _CHOICE = range(8)
 # Candidates that a rejection round makes at once.
 _BATCH = 4096
+_MOST_AGE = 10_000
 
 
 class UniformStart:
@@ -33,6 +46,7 @@ class UniformStart:
         observe_start: whether the robots observe their locations before the first control.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if ``robots`` does not give one location for each robot.
 
     Examples:
@@ -42,15 +56,17 @@ class UniformStart:
     """
 
     def __init__(self, model: RepairModel, robots: tuple[int, ...] = (0,), *, observe_start: bool = True) -> None:
-        if len(robots) != model.num_robots or not all(0 <= place < model.num_locations for place in robots):
-            raise ValueError(
-                f"robots must be {model.num_robots} locations in 0..{model.num_locations - 1}, got {tuple(robots)}"
-            )
-        self.model, self.robots, self.observe_start = model, tuple(robots), observe_start
+        check_instance("model", model, RepairModel)
+        check_instance("robots", robots, (tuple, list))
+        if len(robots) != model.num_robots:
+            raise ValueError(f"robots must be {model.num_robots} locations, one for each robot, got {tuple(robots)}")
+        robots = tuple(check_integer(f"robots[{i}]", place, 0, model.num_locations - 1) for i, place in enumerate(robots))
+        check_flag("observe_start", observe_start)
+        self.model, self.robots, self.observe_start = model, robots, observe_start
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
-        model = self.model
+        model, keys = self.model, check_keys("keys", keys)
         shape = (*keys.shape, model.num_locations, model.num_levels)
         belief = torch.full(shape, 1.0 / model.num_levels, dtype=model.dtype, device=keys.device)
         location = torch.tensor(self.robots, device=keys.device).expand(*keys.shape, -1).clone()
@@ -68,6 +84,7 @@ class CalibratedStart:
         observe_start: whether the robots observe their locations before the first control.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if ``damaged_fraction`` is not in (0, 1].
 
     Examples:
@@ -79,14 +96,14 @@ class CalibratedStart:
     """
 
     def __init__(self, model: RepairModel, damaged_fraction: float = 0.7, *, observe_start: bool = True) -> None:
-        if not 0.0 < damaged_fraction <= 1.0:
-            raise ValueError(f"damaged_fraction must be in (0, 1], got {damaged_fraction}")
-        self.model, self.observe_start = model, observe_start
+        check_instance("model", model, RepairModel)
+        check_number("damaged_fraction", damaged_fraction, "(0, 1]")
+        self.model, self.observe_start = model, check_flag("observe_start", observe_start)
         self.num_damaged = max(1, round(damaged_fraction * model.num_locations))
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
-        belief = _random_beliefs(self.model, keys, torch.full_like(keys, self.num_damaged))
+        belief = _random_beliefs(self.model, check_keys("keys", keys), torch.full_like(keys, self.num_damaged))
         return _place(self.model, keys, belief, _anywhere(self.model, keys), self.observe_start)
 
 
@@ -99,10 +116,11 @@ class RandomState:
     Args:
         model: the repair model.
         fractions: lowest and highest fraction of possibly damaged locations, 0 <= low <= high <= 1.
-        max_age: largest number of stages the beliefs have degraded.
+        max_age: largest number of stages the beliefs have degraded, at most 10000.
 
     Raises:
-        ValueError: if the fractions are not ordered in [0, 1] or ``max_age`` is negative.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if the fractions are not ordered in [0, 1] or ``max_age`` is out of bounds.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -113,22 +131,28 @@ class RandomState:
     """
 
     def __init__(self, model: RepairModel, fractions: tuple[float, float] = (0.0, 1.0), max_age: int = 40) -> None:
-        low, high = fractions
-        if not 0.0 <= low <= high <= 1.0:
+        check_instance("model", model, RepairModel)
+        check_instance("fractions", fractions, (tuple, list))
+        if len(fractions) != 2:
+            raise ValueError(f"fractions must be the lowest and the highest fraction, got {shown(fractions)}")
+        low, high = (check_number(f"fractions[{i}]", share, "[0, 1]") for i, share in enumerate(fractions))
+        if low > high:
             raise ValueError(f"fractions must satisfy 0 <= low <= high <= 1, got {fractions}")
-        if max_age < 0:
-            raise ValueError(f"max_age must not be negative, got {max_age}")
-        self.model, self.max_age = model, max_age
+        self.model, self.max_age = model, check_integer("max_age", max_age, 0, _MOST_AGE)
         self.range = max(1, round(low * model.num_locations)), max(1, round(high * model.num_locations))
-        powers = [torch.linalg.matrix_power(model.chain, age) for age in range(max_age + 1)]
-        self._powers = torch.stack(powers)
+        # A library's products of matrices may differ by the machine's threads; with so few numbers one thread does them.
+        self._powers = torch.stack([torch.linalg.matrix_power(model.chain, age) for age in range(max_age + 1)])
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
-        low, high = self.range
+        (low, high), keys = self.range, check_keys("keys", keys)
         count = low + (_uniforms(keys, _FRACTION, 1).squeeze(-1) * (high - low + 1)).to(torch.int64)
         age = (_uniforms(keys, _AGE, 1).squeeze(-1) * (self.max_age + 1)).to(torch.int64)
-        belief = _random_beliefs(self.model, keys, count) @ self._powers[age]
+        fresh, powers = _random_beliefs(self.model, keys, count), self._powers[age].unsqueeze(-3)
+        # Level by level, as a library's product of matrices would round by the number of states.
+        belief = fresh[..., :1] * powers[..., 0, :]
+        for level in range(1, self.model.num_levels):
+            belief += fresh[..., level, None] * powers[..., level, :]
         return _place(self.model, keys, belief, _anywhere(self.model, keys), observe=True)
 
 
@@ -142,6 +166,7 @@ class InPart:
         max_tries: candidates for one state before giving up.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if ``part`` is not a part of the model's partition; when called, if a state has no acceptable
             candidate among ``max_tries``.
 
@@ -154,16 +179,18 @@ class InPart:
     """
 
     def __init__(self, model: BeliefModel, proposal: StateGenerator, part: int, max_tries: int = 500) -> None:
-        if model.partition is None or not 0 <= part < model.partition.num_parts:
-            parts = 0 if model.partition is None else model.partition.num_parts
+        check_instance("model", model, BeliefModel)
+        self.proposal = check_callable("proposal", proposal)
+        parts = 0 if model.partition is None else model.partition.num_parts
+        if model.partition is None or not 0 <= check_integer("part", part) < parts:
             raise ValueError(f"part must be one of the model's {parts} parts, got {part}")
-        self.model, self.proposal, self.part, self.max_tries = model, proposal, part, max_tries
+        self.model, self.part, self.max_tries = model, part, check_integer("max_tries", max_tries, 1, 1_000_000)
         self.partition = model.partition
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` of the part for int64 keys ``[*B]``; terminal states are rejected too."""
-        flat = keys.reshape(-1)
-        result = self.proposal(flat)
+        flat = check_keys("keys", keys).reshape(-1)
+        result = self.model.drawn(self.proposal, flat)
         missing = (~self._accepted(result)).nonzero().squeeze(-1)
         tried = 1
         while missing.numel() and tried < self.max_tries:
@@ -171,7 +198,7 @@ class InPart:
             width = min(max(1, _BATCH // missing.numel()), self.max_tries - tried)
             attempts = torch.arange(tried, tried + width, device=keys.device)
             tried += width
-            candidates = self.proposal(fold(fold(flat[missing], _RETRY).unsqueeze(-1), attempts).flatten())
+            candidates = self.model.drawn(self.proposal, fold(fold(flat[missing], _RETRY).unsqueeze(-1), attempts).flatten())
             accepted = self._accepted(candidates).view(-1, width)
             found, first = accepted.any(-1), accepted.to(torch.int64).argmax(-1)
             chosen = torch.arange(missing.numel(), device=keys.device) * width + first
@@ -197,7 +224,8 @@ class Mixture:
         weights: their probabilities, nonnegative with positive sum.
 
     Raises:
-        ValueError: if there is not one nonnegative weight for each generator.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if there is no generator, or not one nonnegative weight for each of them.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -207,11 +235,17 @@ class Mixture:
     """
 
     def __init__(self, generators: Sequence[StateGenerator], weights: Sequence[float]) -> None:
-        if len(generators) != len(weights) or not generators or min(weights) < 0 or sum(weights) <= 0:
-            raise ValueError(f"weights must be {len(generators)} nonnegative numbers with positive sum, got {list(weights)}")
+        check_instance("generators", generators, (list, tuple))
+        if not generators:
+            raise ValueError("generators is empty: a mixture needs at least one")
+        for i, generator in enumerate(generators):
+            check_callable(f"generators[{i}]", generator)
+        shares_given = check_tensor("weights", weights, (len(generators),)).to(torch.float32)
+        if not bool((shares_given >= 0).all()) or not 0 < float(shares_given.sum()) < torch.inf:
+            raise ValueError(f"weights must be {len(generators)} nonnegative numbers with positive sum, got {shown(weights)}")
         self.generators: list[StateGenerator] = []
         shares: list[Tensor] = []
-        for generator, weight in zip(generators, torch.tensor(weights, dtype=torch.float32), strict=True):
+        for generator, weight in zip(generators, shares_given, strict=True):
             if isinstance(generator, Mixture):
                 self.generators += generator.generators
                 shares.append(weight * generator.weights / generator.weights.sum())
@@ -222,7 +256,7 @@ class Mixture:
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` for int64 keys ``[*B]``."""
-        flat = keys.reshape(-1)
+        flat = check_keys("keys", keys).reshape(-1)
         probs = self.weights.to(keys.device).expand(flat.numel(), -1)
         which = inverse_cdf(probs, uniform(fold(flat, _CHOICE), 0))
         return draw_each(self.generators, which, flat).view(keys.shape)
@@ -234,22 +268,32 @@ class FixedBelief:
     Args:
         belief: probabilities of the states, ``[n]``.
 
+    Raises:
+        TypeError: if ``belief`` is no floating tensor.
+        ValueError: if it is no distribution.
+
     Examples:
         >>> FixedBelief(torch.tensor([0.5, 0.5]))(torch.arange(3))["belief"].shape
         torch.Size([3, 2])
     """
 
     def __init__(self, belief: Tensor) -> None:
-        self.belief = belief
+        check_instance("belief", belief, Tensor)
+        if not belief.is_floating_point():
+            raise TypeError(f"belief must be a floating tensor, got {belief.dtype}")
+        if belief.ndim != 1 or not belief.numel():
+            raise ValueError(f"belief must have shape (n), at least one state, got {tuple(belief.shape)}")
+        self.belief = check_distributions("belief", check_tensor("belief", belief)).clone()
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` for int64 keys ``[*B]``."""
+        keys = check_keys("keys", keys)
         return TensorDict({"belief": self.belief.expand(*keys.shape, -1).clone()}, batch_size=keys.shape)
 
 
 def draw_each(generators: Sequence[StateGenerator], which: Tensor, keys: Tensor) -> TensorDictBase:
     """States ``[N]`` for keys ``[N]``, the i-th from the generator number ``which[i]``."""
-    drawn = [generator(keys[which == i]) for i, generator in enumerate(generators) if bool((which == i).any())]
+    drawn = [generated(generator, keys[which == i]) for i, generator in enumerate(generators) if bool((which == i).any())]
     return torch.cat(drawn, 0)[which.argsort(stable=True).argsort()]
 
 
@@ -272,7 +316,8 @@ def _random_beliefs(model: RepairModel, keys: Tensor, num_damaged: Tensor) -> Te
     weight = -torch.log1p(-_uniforms(keys, _LEVELS, size * levels).double()).view(*keys.shape, size, levels)
     weight = weight.clamp_min(2.0**-30)
     intact = torch.eye(levels, dtype=weight.dtype, device=keys.device)[0]
-    return torch.where(damaged, weight / weight.sum(-1, keepdim=True), intact).to(model.dtype)
+    total = sum_first(weight.movedim(-1, 0).clone()).unsqueeze(-1)
+    return torch.where(damaged, weight / total, intact).to(model.dtype)
 
 
 def _place(model: RepairModel, keys: Tensor, belief: Tensor, location: Tensor, observe: bool) -> TensorDictBase:

@@ -13,10 +13,14 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from torchrl_pomdp.checks import check_device, check_instance, check_integer, check_number, check_tensor, check_text, shown
 from torchrl_pomdp.envs.graphs import Graph
 from torchrl_pomdp.envs.sums import sum_first
 
 __all__ = ["Partition", "RepairPartition", "SinglePart"]
+
+# How many different columns a plan can have from its left to its right edge.
+_COLUMN_UNITS = 2.0**18
 
 
 class Partition(nn.Module, ABC):
@@ -35,6 +39,25 @@ class Partition(nn.Module, ABC):
     def num_parts(self) -> int:
         """N, the number of parts."""
         return len(self.names)
+
+    def check(self) -> None:
+        """Raise unless parts have names and every part belongs to one stage; models do it when they get a partition.
+
+        Raises:
+            TypeError: if ``names`` or ``stages`` is missing or of the wrong kind.
+            ValueError: if there is no part, a name is empty, or a part is in no stage or in several.
+        """
+        kind = type(self).__name__
+        names = check_instance(f"names of partition {kind}", getattr(self, "names", None), (tuple, list))
+        stages = check_instance(f"stages of partition {kind}", getattr(self, "stages", None), (tuple, list))
+        if not names:
+            raise ValueError(f"names of partition {kind} must hold at least one name, got none")
+        for part, name in enumerate(names):
+            check_text(f"names[{part}] of partition {kind}", name)
+        groups = [check_instance(f"stages[{i}] of partition {kind}", stage, (tuple, list)) for i, stage in enumerate(stages)]
+        staged = [check_integer(f"a part in stages of partition {kind}", part) for stage in groups for part in stage]
+        if sorted(staged) != list(range(len(names))):
+            raise ValueError(f"stages of partition {kind} must hold every part 0..{len(names) - 1} once, got {shown(stages)}")
 
     @abstractmethod
     def forward(self, y: TensorDictBase) -> Tensor:
@@ -74,6 +97,10 @@ class RepairPartition(Partition):
         damage_threshold: probability of damage above which a location is believed damaged.
         device: where the tables are.
 
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if ``costs`` are not finite and nonnegative or ``damage_threshold`` is not in [0, 1).
+
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
         >>> problem = make_problem("linear20")
@@ -97,11 +124,27 @@ class RepairPartition(Partition):
         self, graph: Graph, costs: Tensor, *, damage_threshold: float = 0.0, device: torch.device | str = "cpu"
     ) -> None:
         super().__init__()
-        if not 0.0 <= damage_threshold < 1.0:
-            raise ValueError(f"damage_threshold must be in [0, 1), got {damage_threshold}")
-        self.damage_threshold = damage_threshold
+        check_instance("graph", graph, Graph)
+        self.damage_threshold = check_number("damage_threshold", damage_threshold, "[0, 1)")
+        costs = check_tensor("costs", costs, (None,), finite=False)
+        if len(costs) < 2 or not bool((torch.isfinite(costs.float()) & (costs >= 0)).all()):
+            raise ValueError(f"costs must be finite and nonnegative for at least 2 levels, got {costs.tolist()}")
         self._prices = tuple(costs.tolist())
-        self.register_buffer("columns", graph.columns.to(device), persistent=False)
+        # In units below which two columns count as equal: coordinates are rounded.
+        columns = graph.columns.double() - graph.columns.double().min()
+        columns = columns / (float(columns.max()) or 1.0) * _COLUMN_UNITS
+        self.register_buffer("columns", columns.float().to(check_device("device", device)), persistent=False)
+
+    def check_fits(self, num_locations: int, num_levels: int, device: torch.device) -> None:
+        """Raise unless this is a partition for so many locations and levels, on the same device."""
+        own = len(self.columns), len(self._prices)
+        if own != (num_locations, num_levels):
+            raise ValueError(
+                f"partition must be for {num_locations} locations and {num_levels} levels as the model is, "
+                f"got one for {own[0]} locations and {own[1]} levels"
+            )
+        if self.columns.device != device:
+            raise ValueError(f"partition must be on the model's device {device}, got one on {self.columns.device}")
 
     def forward(self, y: TensorDictBase) -> Tensor:
         """Part index int64 ``[*B]``: three times the phase (0 startgame, 1 endgame) plus the density class."""
@@ -117,9 +160,10 @@ class RepairPartition(Partition):
         """0 where the damage is mostly left, 1 where balanced, 2 where mostly right: int64 ``[*B]``."""
         cost = location_costs(planes, self._prices)
         column = self.columns.view(-1, *([1] * (cost.ndim - 1)))
-        centre = self.columns[location].mean(-1)
-        # 1 left of the robots, 0 at and right of them: their mean column is a multiple of 1 / R.
-        side = (centre - column) * location.shape[-1]
+        # R times the robots' mean column.
+        centre = sum_first(self.columns[location].movedim(-1, 0).clone())
+        # At least 1 left of the robots, 0 at them, at most -1 right of them.
+        side = (centre - column * location.shape[-1]).trunc_()
         left, right = sum_first(cost * side.clamp(0, 1)), sum_first(cost * side.neg_().clamp_(0, 1))
         low, high = self.density_bounds
         total = left + right

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import torch
 
-from torchrl_pomdp.envs.belief import StateGenerator
+from torchrl_pomdp.checks import check_callable, check_device, check_flag, check_instance, check_text, shown
+from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
+from torchrl_pomdp.envs.chains import damage_chain
 from torchrl_pomdp.envs.generators import CalibratedStart, InPart, Mixture, RandomState, UniformStart
 from torchrl_pomdp.envs.graphs import Graph, grid, line
 from torchrl_pomdp.envs.partition import Partition, RepairPartition, SinglePart
-from torchrl_pomdp.envs.repair import RepairModel, damage_chain
+from torchrl_pomdp.envs.repair import RepairModel
 
 __all__ = ["PRESETS", "Problem", "make_problem"]
 
@@ -30,6 +32,10 @@ class Problem:
         start: start states of play and evaluation.
         training: one generator of random training states for each part of the model's partition.
         partitioned: whether the model has the preset's partition, or a single part.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if there is not one training generator for each part.
     """
 
     name: str
@@ -37,6 +43,19 @@ class Problem:
     start: StateGenerator
     training: tuple[StateGenerator, ...]
     partitioned: bool = True
+
+    def __post_init__(self) -> None:
+        check_text("name", self.name)
+        check_instance("model", self.model, BeliefModel)
+        check_callable("start", self.start)
+        check_flag("partitioned", self.partitioned)
+        check_instance("training", self.training, (tuple, list))
+        object.__setattr__(self, "training", tuple(self.training))
+        for part, generator in enumerate(self.training):
+            check_callable(f"training[{part}]", generator)
+        parts = 1 if self.model.partition is None else self.model.partition.num_parts
+        if len(self.training) != parts:
+            raise ValueError(f"training must hold {parts} generators, one for each part, got {len(self.training)}")
 
 
 @dataclass(frozen=True)
@@ -68,7 +87,8 @@ def make_problem(name: str, *, partitioned: bool = True, device: torch.device | 
         device: where the model computes.
 
     Raises:
-        ValueError: if there is no such preset; the message lists the known ones.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if there is no such problem, the message lists the known ones, or no such device.
 
     Examples:
         >>> make_problem("linear20").model.describe()
@@ -76,8 +96,12 @@ def make_problem(name: str, *, partitioned: bool = True, device: torch.device | 
         >>> make_problem("grid5x4", partitioned=False).model.partition.num_parts
         1
     """
+    check_text("name", name)
+    check_flag("partitioned", partitioned)
+    device = check_device("device", device)
     if name not in PRESETS:
-        raise ValueError(f"unknown preset {name!r}; known presets: {', '.join(sorted(PRESETS))}")
+        known = ", ".join(sorted(PRESETS))
+        raise ValueError(f"name must be that of a problem: unknown preset {shown(name)}; known presets: {known}")
     preset = PRESETS[name]
     six = RepairPartition(preset.graph, torch.tensor(COSTS), device=device)
     model = _repair_model(preset, six, device)

@@ -12,44 +12,34 @@ elementwise passes over contiguous memory. What callers see is a ``[*B, L, K]`` 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite
 
+from torchrl_pomdp.checks import (
+    check_device,
+    check_distributions,
+    check_dtype,
+    check_instance,
+    check_integer,
+    check_number,
+)
 from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf
+from torchrl_pomdp.envs.chains import checked_chain, checked_costs, drifts, off_diagonals, overflowing_levels
 from torchrl_pomdp.envs.graphs import Graph
-from torchrl_pomdp.envs.partition import Partition, location_costs
-from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.envs.partition import Partition, RepairPartition, location_costs
+from torchrl_pomdp.envs.sums import multiply_first, sum_first
 
-__all__ = ["REPAIR", "RepairModel", "damage_chain"]
+__all__ = ["REPAIR", "RepairModel"]
 
 REPAIR = 0
 """A robot's control *repair*; control ``1 + s`` moves along slot ``s`` of the graph."""
 
-
-def damage_chain(degradation: tuple[float, ...]) -> Tensor:
-    r"""The paper's damage chain: level k rises to k+1 with probability :math:`\gamma_k`, the last level is absorbing.
-
-    Args:
-        degradation: :math:`\gamma_0,\dots,\gamma_{\zeta-1}`, each in [0, 1].
-
-    Returns:
-        row-stochastic matrix ``[K, K]``, K = len(degradation) + 1.
-
-    Raises:
-        ValueError: if a probability is outside [0, 1].
-
-    Examples:
-        >>> damage_chain((0.0, 0.25)).tolist()
-        [[1.0, 0.0, 0.0], [0.0, 0.75, 0.25], [0.0, 0.0, 1.0]]
-    """
-    if not degradation or not all(0.0 <= p <= 1.0 for p in degradation):
-        raise ValueError(f"degradation must hold probabilities in [0, 1], at least one, got {degradation}")
-    rise = torch.tensor(degradation, dtype=torch.float64)
-    return torch.diag(torch.cat([1.0 - rise, rise.new_ones(1)])) + torch.diag(rise, 1)
+MAX_JOINT = 1 << 16
+"""Largest number of joint controls or joint observations."""
 
 
 class RepairModel(BeliefModel):
@@ -68,17 +58,18 @@ class RepairModel(BeliefModel):
         discount: :math:`\alpha`.
 
     Keyword Args:
-        num_robots: R, at least 1.
+        num_robots: R, at least 1; joint controls and joint observations are at most 65536.
         terminal_probability: :math:`\epsilon`, in [0, 1).
         partition: partition whose index becomes a feature.
         dtype: float32 or float64.
         device: where the model computes.
 
     Raises:
-        ValueError: if an argument is out of range; the message names it.
+        TypeError: if an argument is of the wrong kind; the message names it.
+        ValueError: if an argument is out of range, or the partition is of another graph or other levels.
 
     Examples:
-        >>> from torchrl_pomdp.envs import line
+        >>> from torchrl_pomdp.envs import damage_chain, line
         >>> model = RepairModel(line(20), damage_chain((0, 0.02, 0.03, 0.05)), (0, 0.1, 1, 10, 100), 0.99)
         >>> model.describe()
         'line of 20, 1 robot: 1.9e+15 states, 3 controls, 5 observations, discount 0.99'
@@ -96,7 +87,7 @@ class RepairModel(BeliefModel):
         self,
         graph: Graph,
         chain: Tensor,
-        costs: Tensor | tuple[float, ...],
+        costs: Tensor | Sequence[float],
         discount: float,
         *,
         num_robots: int = 1,
@@ -106,22 +97,27 @@ class RepairModel(BeliefModel):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(discount, partition)
-        chain, costs = torch.as_tensor(chain), torch.as_tensor(costs)
-        _check_chain(chain)
-        _check_costs(costs, chain.shape[0])
-        if num_robots < 1:
-            raise ValueError(f"num_robots must be at least 1, got {num_robots}")
-        if not 0.0 <= terminal_probability < 1.0:
-            raise ValueError(f"terminal_probability must be in [0, 1), got {terminal_probability}")
-        self.graph = graph
-        self.num_locations, self.num_levels, self.num_robots = graph.num_locations, chain.shape[0], num_robots
+        self.graph = check_instance("graph", graph, Graph)
+        dtype, device = check_dtype("dtype", dtype), check_device("device", device)
+        chain = checked_chain(chain)
+        self.num_locations, self.num_levels = graph.num_locations, chain.shape[0]
+        costs = checked_costs(costs, self.num_levels, dtype)
+        self.num_robots = check_integer("num_robots", num_robots, 1, 16)
         self.num_robot_controls = len(graph.control_names)
-        self.num_controls = self.num_robot_controls**num_robots
-        self.num_observations = self.num_levels**num_robots
-        self.noise_dim = num_robots
-        self.terminal_probability = terminal_probability
+        self.num_controls = self.num_robot_controls**self.num_robots
+        self.num_observations = self.num_levels**self.num_robots
+        if max(self.num_controls, self.num_observations) > MAX_JOINT:
+            raise ValueError(
+                f"num_robots is too large: {num_robots} robots have {self.num_controls} joint controls and "
+                f"{self.num_observations} joint observations, at most {MAX_JOINT} are allowed"
+            )
+        self.noise_dim = self.num_robots
+        self.terminal_probability = check_number("terminal_probability", terminal_probability, "[0, 1)")
         self.level_zero_absorbing = bool(chain[0, 0] == 1)
-        self._register_tables(chain.to(dtype), costs.to(dtype), torch.device(device))
+        self._normalise = drifts(chain, dtype)
+        self._register_tables(chain.to(dtype), costs, device)
+        if isinstance(partition, RepairPartition):
+            partition.check_fits(self.num_locations, self.num_levels, self.device)
 
     def _register_tables(self, chain: Tensor, costs: Tensor, device: torch.device) -> None:
         nodes = torch.arange(self.num_locations).unsqueeze(-1)
@@ -141,7 +137,8 @@ class RepairModel(BeliefModel):
             self.register_buffer(name, value.to(device), persistent=False)
         self._prices, self._chain_rows = tuple(costs.tolist()), chain.tolist()
         self._stay = self.chain.diagonal().view(-1, 1)
-        self._diagonals = list(_off_diagonals(self.chain))
+        self._diagonals = list(off_diagonals(self.chain))
+        self._overflowing = overflowing_levels(chain)
 
     # ---- specs and descriptions ----------------------------------------------------------------------------------
 
@@ -170,6 +167,11 @@ class RepairModel(BeliefModel):
             shape=shape,
             device=self.device,
         )
+
+    def check_state(self, y: TensorDictBase) -> None:
+        """Raise unless ``y`` is a feature state; see :meth:`BeliefModel.check_state`. Marginals must sum to one."""
+        super().check_state(y)
+        check_distributions("entry 'belief' of y", y.get("belief"))
 
     def describe(self) -> str:
         """Graph, robots, and the numbers of states, controls and observations."""
@@ -213,7 +215,7 @@ class RepairModel(BeliefModel):
         """Bool ``[*B]``: P(any damage) <= ``terminal_probability``; never where level 0 is not absorbing."""
         if not self.level_zero_absorbing:
             return torch.zeros(y.batch_size, dtype=torch.bool, device=self.device)
-        intact = self._planes(y)[:, 0].prod(0)
+        intact = multiply_first(self._planes(y)[:, 0].clone())
         return (1.0 - intact <= self.terminal_probability).view(y.batch_size)
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
@@ -233,10 +235,18 @@ class RepairModel(BeliefModel):
         return joint.movedim(0, -1).reshape(*y.batch_size, self.num_observations)
 
     def estimator(self, y: TensorDictBase, u: Tensor, z: Tensor) -> TensorDictBase:
-        """F(y, u, z): degrade, then set the levels observed where the robots now stand (0 after a repair)."""
-        location, _ = self._move(y, u)
+        """F(y, u, z): degrade, then set the levels observed where the robots now stand (0 after a repair).
+
+        Raises:
+            ValueError: if a control is illegal or an observation impossible.
+        """
+        self.check_controls(y, u)
+        self.check_observations(y, z)
+        location, repaired = self._move(y, u)
         levels = _digits(z.reshape(-1), self.num_levels, self.num_robots).T
-        return self._successor(y, self._next_planes(self._planes(y), location, levels), location)
+        planes = self._degrade_planes(self._planes(y))
+        self._refuse_impossible(z, self._possible(planes, location, repaired, levels).view(y.batch_size))
+        return self._successor(y, self._set_levels(planes, location, levels), location)
 
     def advance(self, y: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase]:
         """One sampled step; robot r observes with ``noise[..., r]``. See :meth:`BeliefModel.advance`."""
@@ -284,13 +294,28 @@ class RepairModel(BeliefModel):
         columns = []
         for robot, place in enumerate(location):
             column = self._degrade_planes(self._levels_at(planes, place).unsqueeze(0)).squeeze(0)
-            # Repairs hold for every robot there: one that repairs has not moved.
-            fixed = repaired[robot]
-            for other in range(self.num_robots):
-                if other != robot:
-                    fixed = fixed | (repaired[other] & (location[other] == place))
-            columns.append(torch.where(fixed, intact, column))
+            columns.append(torch.where(self._fixed(robot, location, repaired), intact, column))
         return columns
+
+    def _possible(self, planes: Tensor, location: Tensor, repaired: Tensor, levels: Tensor) -> Tensor:
+        """Whether the robots can see ``levels`` ``[R, N]``, bool ``[N]``, given the degraded ``planes``."""
+        possible = torch.ones_like(repaired[0])
+        for robot, (place, level) in enumerate(zip(location, levels, strict=True)):
+            cell = (place * self.num_levels + level).unsqueeze(0)
+            seen = planes.flatten(0, 1).gather(0, cell).squeeze(0) > 0
+            possible &= torch.where(self._fixed(robot, location, repaired), level == 0, seen)
+            for other in range(robot):
+                # Robots that stand together see the same level.
+                possible &= (place != location[other]) | (level == levels[other])
+        return possible
+
+    def _fixed(self, robot: int, location: Tensor, repaired: Tensor) -> Tensor:
+        """Whether the place of a robot is repaired, bool ``[N]``: for every robot there, as one that repairs has not moved."""
+        fixed = repaired[robot]
+        for other in range(self.num_robots):
+            if other != robot:
+                fixed = fixed | (repaired[other] & (location[other] == location[robot]))
+        return fixed
 
     def _draw_levels(self, columns: list[Tensor], location: Tensor, noise: Tensor) -> Tensor:
         """Levels ``[R, N]`` that the robots see; those that stand together see the same."""
@@ -313,26 +338,36 @@ class RepairModel(BeliefModel):
         location, levels = (rows.to(self.dtype).as_strided(rows.shape, rows.stride()) for rows in (location, levels))
         here = [places == place for place in location]
         result = []
-        for k in range(self.num_levels):
-            plane = self._next_level(planes, k)
+        for k, plane in enumerate(self._next_levels(planes)):
             for at, level in zip(here, levels, strict=True):
                 plane = torch.where(at, (level == k).to(self.dtype), plane)
             result.append(plane)
         return torch.stack(result, 1)
 
-    def _next_level(self, planes: Tensor, level: int) -> Tensor:
-        """Probability ``[L, N]`` of a level after one step of the chain."""
-        weights = [row[level] for row in self._chain_rows]
-        terms = [planes[:, k] if w == 1 else planes[:, k] * w for k, w in enumerate(weights) if w > 0]
-        return sum(terms[1:], terms[0]) if terms else torch.zeros_like(planes[:, 0])
+    def _next_levels(self, planes: Tensor) -> list[Tensor]:
+        """Probabilities ``[L, N]`` of all levels after one step of the chain, one after the other: for the compiler."""
+        result = []
+        for level in range(self.num_levels):
+            weights = [row[level] for row in self._chain_rows]
+            terms = [planes[:, k] if w == 1 else planes[:, k] * w for k, w in enumerate(weights) if w > 0]
+            plane = sum(terms[1:], terms[0]) if terms else torch.zeros_like(planes[:, 0])
+            result.append(plane.clamp(max=1.0) if level in self._overflowing else plane)
+        if not self._normalise:
+            return result
+        total = sum(result[1:], result[0])
+        return [plane / total for plane in result]
 
     def _degrade_planes(self, planes: Tensor) -> Tensor:
         """One step of the chain in every location: a pass over the planes for each nonzero diagonal."""
         if torch.compiler.is_compiling():
-            return torch.stack([self._next_level(planes, level) for level in range(self.num_levels)], 1)
+            return torch.stack(self._next_levels(planes), 1)
         result = planes * self._stay
         for source, target, probs in self._diagonals:
             result[:, target].addcmul_(planes[:, source], probs)
+        for level in self._overflowing:
+            result[:, level].clamp_(max=1.0)
+        if self._normalise:
+            result /= sum_first(result.transpose(0, 1).clone()).unsqueeze(1)
         return result
 
     def _set_levels(self, planes: Tensor, location: Tensor, levels: Tensor) -> Tensor:
@@ -360,37 +395,8 @@ def _digits(number: Tensor, base: int, count: int) -> Tensor:
     return number.unsqueeze(-1) // powers % base
 
 
-def _off_diagonals(chain: Tensor) -> Iterator[tuple[slice, slice, Tensor]]:
-    """Source levels, target levels and probabilities ``[., 1]`` of the chain's nonzero off-diagonals."""
-    size = chain.shape[0]
-    for offset in range(1 - size, size):
-        probs = chain.diagonal(offset)
-        if offset != 0 and bool((probs != 0).any()):
-            low, high = slice(0, size - abs(offset)), slice(abs(offset), size)
-            source, target = (low, high) if offset > 0 else (high, low)
-            yield source, target, probs.view(-1, 1)
-
-
 def _scientific(number: int) -> tuple[float, int]:
     """Mantissa and decimal exponent of an integer that may exceed the floats."""
     exponent = math.floor(math.log10(number))
     mantissa = round(number / 10**exponent, 1)
     return (mantissa, exponent) if mantissa < 10 else (1.0, exponent + 1)
-
-
-def _check_chain(chain: Tensor) -> None:
-    if chain.ndim != 2 or chain.shape[0] != chain.shape[1] or chain.shape[0] < 2:
-        raise ValueError(f"chain must be a square matrix of at least 2 levels, got shape {tuple(chain.shape)}")
-    if not bool((chain >= 0).all()):
-        raise ValueError(f"chain must hold nonnegative probabilities, got {chain.tolist()}")
-    sums = chain.double().sum(-1)
-    wrong = ((sums - 1.0).abs() > 1e-6).nonzero().flatten().tolist()
-    if wrong:
-        raise ValueError(f"rows of chain must sum to 1, row {wrong[0]} sums to {float(sums[wrong[0]]):.6g}")
-
-
-def _check_costs(costs: Tensor, num_levels: int) -> None:
-    if costs.shape != (num_levels,):
-        raise ValueError(f"costs must have shape ({num_levels},), one for each level of chain, got {tuple(costs.shape)}")
-    if not bool((torch.isfinite(costs) & (costs >= 0)).all()):
-        raise ValueError(f"costs must be finite and nonnegative, got {costs.tolist()}")

@@ -1,14 +1,14 @@
-"""Sums whose rounding does not depend on the batch.
+"""Sums and products whose rounding does not depend on the batch.
 
 A label must be a function of its state alone, to the last bit. Libraries add a column's numbers in an order that depends on
-the size of the batch and on the column's place in it; elementwise additions leave them no such choice.
+the size of the batch and on the column's place in it; elementwise operations leave them no such choice.
 """
 
 from __future__ import annotations
 
 from torch import Tensor
 
-__all__ = ["sum_first"]
+__all__ = ["multiply_first", "sum_first"]
 
 
 def sum_first(terms: Tensor) -> Tensor:
@@ -31,3 +31,25 @@ def sum_first(terms: Tensor) -> Tensor:
         terms[: count - half].add_(terms[half:count])
         count = half
     return terms[0]
+
+
+def multiply_first(factors: Tensor) -> Tensor:
+    """Product over the first dimension by halving, in the same order for every column; overwrites ``factors``.
+
+    Args:
+        factors: ``[n, *B]``, n >= 1.
+
+    Returns:
+        ``[*B]``.
+
+    Examples:
+        >>> import torch
+        >>> multiply_first(torch.arange(1.0, 7.0).view(3, 2)).tolist()
+        [15.0, 48.0]
+    """
+    count = factors.shape[0]
+    while count > 1:
+        half = (count + 1) // 2
+        factors[: count - half].mul_(factors[half:count])
+        count = half
+    return factors[0]

@@ -10,16 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import permutations, product
+from itertools import islice, permutations, product
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.graphs import Graph
 from torchrl_pomdp.envs.repair import RepairModel
 
 __all__ = ["Symmetry", "symmetries"]
+
+# Orders of five robots; with more robots, only the last five change places.
+_MOST_ORDERS = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,20 +63,27 @@ class Symmetry:
 
 
 def symmetries(model: RepairModel) -> list[Symmetry]:
-    """All symmetries of a repair model that its graph's columns and rows show, the identity first.
+    """Symmetries of a repair model that its graph's columns and rows show, the identity first.
+
+    These are all reflections and rotations of the plan by right angles that keep the graph, with all exchanges of the robots;
+    of more than five robots the last five are exchanged.
 
     Args:
         model: the repair model.
+
+    Raises:
+        TypeError: if it is no repair model.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
         >>> [len(symmetries(make_problem(name).model)) for name in ("linear20", "grid5x4", "grid6x6", "two_robots20")]
         [2, 4, 8, 4]
     """
+    check_instance("model", model, RepairModel)
     found = []
     for locations, slots in _graph_symmetries(model.graph):
         controls = torch.tensor([0, *(1 + slot for slot in slots)])
-        for order in permutations(range(model.num_robots)):
+        for order in islice(permutations(range(model.num_robots)), _MOST_ORDERS):
             robots = torch.tensor(order, device=model.device)
             every = model.split_controls(torch.arange(model.num_controls, device=model.device))
             joint = model.join_controls(controls.to(model.device)[every[:, robots]])
@@ -82,30 +93,39 @@ def symmetries(model: RepairModel) -> list[Symmetry]:
 
 def _graph_symmetries(graph: Graph) -> Iterator[tuple[list[int], list[int]]]:
     """New names of locations and of slots under the reflections and rotations that map the graph to itself."""
-    columns, rows = graph.columns.tolist(), graph.rows.tolist()
-    places = list(zip(columns, rows, strict=True))
+    places = torch.stack([graph.columns, graph.rows], -1).double()
+    places = places - (places.amax(0) + places.amin(0)) / 2
+    apart = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+    # Coordinates are rounded, to float32 at least: an image is at a place if it is much nearer to it than two places are.
+    tolerance = 1e-2 * float(apart.fill_diagonal_(torch.inf).amin())
     seen = set()
     for turn, across, down in product((False, True), repeat=3):
-        renamed = []
-        for column, row in places:
-            c, r = (row, column) if turn else (column, row)
-            wide, high = (rows, columns) if turn else (columns, rows)
-            image = (max(wide) + min(wide) - c if across else c, max(high) + min(high) - r if down else r)
-            renamed.append(places.index(image) if image in places else -1)
-        slots = _slot_names(graph, renamed) if -1 not in renamed and len(set(renamed)) == len(renamed) else None
-        if slots is not None and tuple(renamed) not in seen:
+        image = places.flip(-1) if turn else places
+        image = image * image.new_tensor([-1.0 if across else 1.0, -1.0 if down else 1.0])
+        distance, nearest = torch.cdist(image, places, compute_mode="donot_use_mm_for_euclid_dist").min(-1)
+        renamed = nearest.tolist()
+        if tuple(renamed) in seen or bool((distance > tolerance).any()):
+            continue
+        slots = _slot_names(graph, renamed)
+        if slots is not None:
             seen.add(tuple(renamed))
             yield renamed, slots
 
 
 def _slot_names(graph: Graph, renamed: list[int]) -> list[int] | None:
-    """New names of the slots if locations are renamed, or None where no renaming of slots keeps the graph."""
-    table = graph.neighbours.tolist()
-    for slots in permutations(range(len(graph.slot_names))):
-        if all(
-            table[renamed[node]][slots[slot]] == (renamed[to] if to >= 0 else -1)
-            for node, row in enumerate(table)
-            for slot, to in enumerate(row)
-        ):
-            return list(slots)
-    return None
+    """New names of the slots if locations are renamed, or None where no renaming of slots keeps the graph.
+
+    A slot must become one that leads from every image to the image of where it led; of several the lowest that is free.
+    """
+    names = torch.tensor([*renamed, -1])
+    old = names[graph.neighbours].T.tolist()
+    free: dict[tuple[int, ...], list[int]] = {}
+    for slot, column in reversed(list(enumerate(graph.neighbours[names[:-1]].T.tolist()))):
+        free.setdefault(tuple(column), []).append(slot)
+    slots = []
+    for column in old:
+        same = free.get(tuple(column))
+        if not same:
+            return None
+        slots.append(same.pop())
+    return slots

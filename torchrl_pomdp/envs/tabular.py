@@ -7,10 +7,15 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 
-from torchrl_pomdp.envs.belief import BeliefModel
+from torchrl_pomdp.checks import check_device, check_distributions, check_dtype, check_tensor
+from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf
 from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.envs.sums import sum_first
 
 __all__ = ["TabularModel", "tiger"]
+
+# States that are summed over at once: temporary tensors hold so many distributions for each row.
+_BLOCK = 16
 
 
 class TabularModel(BeliefModel):
@@ -30,7 +35,8 @@ class TabularModel(BeliefModel):
         device: where the model computes.
 
     Raises:
-        ValueError: if an array has the wrong shape or rows that are no distributions.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if an array has the wrong shape or rows that are no distributions, or a cost is not finite in ``dtype``.
 
     Examples:
         >>> model = tiger()
@@ -55,19 +61,24 @@ class TabularModel(BeliefModel):
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(discount, partition)
-        if transition.ndim != 3 or transition.shape[1] != transition.shape[2]:
-            raise ValueError(f"transition must have shape [U, n, n], got {tuple(transition.shape)}")
+        dtype, device = check_dtype("dtype", dtype), check_device("device", device)
+        transition = check_tensor("transition", transition, finite=False)
+        observation = check_tensor("observation", observation, finite=False)
+        cost = check_tensor("cost", cost, finite=False)
+        if transition.ndim != 3 or transition.shape[1] != transition.shape[2] or not transition.numel():
+            raise ValueError(f"transition must have shape [U, n, n], at least one of each, got {tuple(transition.shape)}")
         self.num_controls, self.num_states, _ = transition.shape
-        if observation.ndim != 3 or observation.shape[:2] != transition.shape[:2]:
+        if observation.ndim != 3 or observation.shape[:2] != transition.shape[:2] or not observation.numel():
             raise ValueError(
                 f"observation must have shape [{self.num_controls}, {self.num_states}, Z], got {tuple(observation.shape)}"
             )
-        if cost.shape != (self.num_states, self.num_controls) or not bool(torch.isfinite(cost).all()):
-            raise ValueError(f"cost must be finite of shape [{self.num_states}, {self.num_controls}], got {tuple(cost.shape)}")
         self.num_observations = observation.shape[-1]
-        for name, array in (("transition", transition), ("observation", observation)):
-            _check_rows(name, array)
-        for name, array in (("transition", transition), ("observation", observation), ("cost", cost)):
+        cost = cost.to(dtype)
+        if cost.shape != (self.num_states, self.num_controls) or not bool(torch.isfinite(cost).all()):
+            shape = f"[{self.num_states}, {self.num_controls}]"
+            raise ValueError(f"cost must be finite of shape {shape} as {dtype}, got {tuple(cost.shape)}")
+        tables = {"transition": _rows("transition", transition), "observation": _rows("observation", observation), "cost": cost}
+        for name, array in tables.items():
             self.register_buffer(name, array.to(device, dtype), persistent=False)
 
     @property
@@ -86,28 +97,74 @@ class TabularModel(BeliefModel):
         belief = Bounded(0.0, 1.0, shape=(*shape, self.num_states), dtype=self.cost.dtype, device=self.device)
         return Composite(belief=belief, shape=shape, device=self.device)
 
+    def check_state(self, y: TensorDictBase) -> None:
+        """Raise unless ``y`` is a feature state; see :meth:`BeliefModel.check_state`. Beliefs must sum to one."""
+        super().check_state(y)
+        check_distributions("entry 'belief' of y", y.get("belief"))
+
     def action_mask(self, y: TensorDictBase) -> Tensor:
         """All True, ``[*B, U]``."""
         return torch.ones(*y.batch_size, self.num_controls, dtype=torch.bool, device=self.device)
 
     def expected_cost(self, y: TensorDictBase, u: Tensor) -> Tensor:
         r""":math:`\sum_i b(i)\,g(i,u)`, ``[*B]``."""
-        return (y.get("belief") * self.cost.T[u]).sum(-1)
+        return sum_first(self.cost[:, u].mul_(y.get("belief").movedim(-1, 0)))
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
         r""":math:`\hat p(z\mid b,u)`, ``[*B, Z]``."""
-        return self._joint(y, u).sum(-2)
+        return self._observed(self._predicted(y, u), u.reshape(-1)).view(*y.batch_size, -1)
 
     def estimator(self, y: TensorDictBase, u: Tensor, z: Tensor) -> TensorDictBase:
-        """F(y, u, z) by Bayes' rule."""
-        index = z[..., None, None].expand(*z.shape, self.num_states, 1)
-        weight = self._joint(y, u).gather(-1, index).squeeze(-1)
-        return self.successor(y, belief=weight / weight.sum(-1, keepdim=True))
+        """F(y, u, z) by Bayes' rule.
 
-    def _joint(self, y: TensorDictBase, u: Tensor) -> Tensor:
-        """P(next state j, observation z), ``[*B, n, Z]``."""
-        predicted = (y.get("belief").unsqueeze(-2) @ self.transition[u]).squeeze(-2)
-        return predicted.unsqueeze(-1) * self.observation[u]
+        Raises:
+            ValueError: if a control is illegal or an observation impossible.
+        """
+        self.check_controls(y, u)
+        self.check_observations(y, z)
+        predicted = self._predicted(y, u)
+        weight, total = self._weigh(predicted, u.reshape(-1), z.reshape(-1))
+        self._refuse_impossible(z, (total > 0).view(y.batch_size))
+        return self._successor(y, weight, total)
+
+    def advance(self, y: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase]:
+        """One sampled step, see :meth:`BeliefModel.advance`."""
+        predicted, control = self._predicted(y, u), u.reshape(-1)
+        z = inverse_cdf(self._observed(predicted, control), noise[..., 0].reshape(-1))
+        return self.expected_cost(y, u), self._successor(y, *self._weigh(predicted, control, z))
+
+    # ---- kernels on N rows -----------------------------------------------------------------------------------------
+
+    def _predicted(self, y: TensorDictBase, u: Tensor) -> Tensor:
+        """P(next state j), ``[N, n]``."""
+        return _mixed(y.get("belief").reshape(-1, self.num_states), self.transition, u.reshape(-1))
+
+    def _observed(self, predicted: Tensor, u: Tensor) -> Tensor:
+        """P(observation z), ``[N, Z]``."""
+        return _mixed(predicted, self.observation, u)
+
+    def _weigh(self, predicted: Tensor, u: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """P(next state j, observation ``z``), ``[N, n]``, and its sum ``[N]``."""
+        weight = predicted * self.observation.transpose(1, 2)[u, z]
+        return weight, sum_first(weight.T.clone())
+
+    def _successor(self, y: TensorDictBase, weight: Tensor, total: Tensor) -> TensorDictBase:
+        return self.successor(y, belief=(weight / total.unsqueeze(-1)).view(*y.batch_size, self.num_states))
+
+
+def _mixed(weight: Tensor, rows: Tensor, u: Tensor) -> Tensor:
+    """Mixtures ``[N, M]`` of the rows ``[U, n, M]`` that belong to controls ``u`` ``[N]``, with weights ``[N, n]``.
+
+    Multiplied and added number by number in an order that n alone decides: a product of matrices would round by N.
+    """
+    source, by_source = weight.T, rows.transpose(0, 1)
+    total: Tensor | None = None
+    for first in range(0, len(source), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        part = sum_first(by_source[block].index_select(1, u).mul_(source[block].unsqueeze(-1)))
+        total = part if total is None else total.add_(part)
+    assert total is not None
+    return total
 
 
 def tiger(discount: float = 0.95, *, device: torch.device | str = "cpu") -> TabularModel:
@@ -132,9 +189,12 @@ def tiger(discount: float = 0.95, *, device: torch.device | str = "cpu") -> Tabu
     return TabularModel(transition, observation, cost, discount, device=device)
 
 
-def _check_rows(name: str, array: Tensor) -> None:
-    sums = array.double().sum(-1)
-    if not bool((array >= 0).all()) or not bool(((sums - 1.0).abs() <= 1e-5).all()):
-        worst = int((sums - 1.0).abs().argmax())
-        where = tuple(int(i) for i in torch.unravel_index(torch.tensor(worst), sums.shape))
-        raise ValueError(f"rows of {name} must be nonnegative and sum to 1; row {where} sums to {float(sums[where]):.6g}")
+def _rows(name: str, array: Tensor) -> Tensor:
+    """The distributions of ``array`` in float64, scaled to sum to one; raises unless they do up to rounding."""
+    rows = array.double()
+    sums = rows.sum(-1, keepdim=True)
+    if not bool((rows >= 0).all()) or not bool(((sums - 1.0).abs() <= 1e-5).all()):
+        worst = int((sums.squeeze(-1) - 1.0).abs().nan_to_num(torch.inf).argmax())
+        where = tuple(int(i) for i in torch.unravel_index(torch.tensor(worst), sums.shape[:-1]))
+        raise ValueError(f"rows of {name} must be nonnegative and sum to 1; row {where} sums to {float(sums[where]):.7g}")
+    return rows / sums

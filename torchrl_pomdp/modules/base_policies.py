@@ -7,8 +7,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_pomdp.checks import check_instance, check_number
 from torchrl_pomdp.envs.partition import location_costs
 from torchrl_pomdp.envs.repair import REPAIR, RepairModel
+from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["GreedyRepair", "UrgencyRepair"]
 
@@ -24,6 +26,7 @@ class GreedyRepair(TensorDictModuleBase):
         damage_threshold: probability in [0, 1); zero means any possibility of damage.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if ``damage_threshold`` is not in [0, 1).
 
     Examples:
@@ -41,10 +44,8 @@ class GreedyRepair(TensorDictModuleBase):
 
     def __init__(self, model: RepairModel, damage_threshold: float = 0.0) -> None:
         super().__init__()
-        if not 0.0 <= damage_threshold < 1.0:
-            raise ValueError(f"damage_threshold must be in [0, 1), got {damage_threshold}")
-        self.model = model
-        self.damage_threshold = damage_threshold
+        self.model = check_instance("model", model, RepairModel)
+        self.damage_threshold = check_number("damage_threshold", damage_threshold, "[0, 1)")
         size = model.num_locations
         # [L, L], target by origin: orders targets by distance, then index, and is below `size * size` for all.
         ranks = model.graph.distances.T * size + torch.arange(size).unsqueeze(-1)
@@ -53,6 +54,7 @@ class GreedyRepair(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``."""
+        check_entries("tensordict", tensordict, self.in_keys)
         size = self.model.num_locations
         belief = tensordict.get("belief").reshape(-1, size, self.model.num_levels)
         location = tensordict.get("location").reshape(-1, self.model.num_robots)
@@ -82,10 +84,11 @@ class UrgencyRepair(TensorDictModuleBase):
 
     Args:
         model: the repair model.
-        exponent: how much the distance counts, not negative.
+        exponent: how much the distance counts, in [0, 100].
 
     Raises:
-        ValueError: if ``exponent`` is negative.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if ``exponent`` is out of range.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -102,12 +105,11 @@ class UrgencyRepair(TensorDictModuleBase):
 
     def __init__(self, model: RepairModel, exponent: float = 3.0) -> None:
         super().__init__()
-        if not exponent >= 0.0:
-            raise ValueError(f"exponent must not be negative, got {exponent}")
-        self.model, self.exponent = model, exponent
+        self.model = check_instance("model", model, RepairModel)
+        self.exponent = check_number("exponent", exponent, "[0, 100]")
         self._prices = tuple(model.costs.tolist())
         # [L, L], target by origin.
-        nearness = (model.graph.distances.T + 1.0) ** -exponent
+        nearness = (model.graph.distances.T + 1.0) ** -self.exponent
         self.register_buffer("nearness", nearness.to(model.device, model.dtype), persistent=False)
         indices = torch.arange(model.num_locations, dtype=model.dtype, device=model.device).unsqueeze(-1)
         self.register_buffer("indices", indices, persistent=False)
@@ -115,6 +117,7 @@ class UrgencyRepair(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``."""
+        check_entries("tensordict", tensordict, self.in_keys)
         model = self.model
         belief = tensordict.get("belief").reshape(-1, model.num_locations, model.num_levels)
         location = tensordict.get("location").reshape(-1, model.num_robots)

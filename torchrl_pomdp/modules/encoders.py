@@ -4,31 +4,34 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torchrl.data import Categorical
 
+from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.belief import BeliefModel
 from torchrl_pomdp.envs.graphs import Graph
 from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.modules.rowwise import affine, align, align_terms, rowwise
+from torchrl_pomdp.tensor_checks import check_entries
 
-__all__ = ["Encoder", "FlatEncoder", "RelativeEncoder", "rowwise"]
-
-# BLAS multiplies a handful of rows by another kernel, which rounds differently: with at least this many rows the
-# output of a row does not depend on the batch it is in.
-_MIN_ROWS = 16
+__all__ = ["Encoder", "FlatEncoder", "RelativeEncoder", "transformed"]
 
 
 class Encoder(nn.Module):
-    """Maps feature states ``[*B]`` to vectors ``[*B, num_features]``, reading the entries ``keys``."""
+    """Maps feature states ``[*B]`` to vectors ``[*B, num_features]`` of type ``dtype``, reading the entries ``keys``."""
 
     keys: tuple[str, ...]
     num_features: int
+    dtype: torch.dtype
 
     def forward(self, y: TensorDictBase) -> Tensor:
         """Features ``[*B, F]`` of feature states ``[*B]``."""
+        check_entries("y", y, self.keys)
         return self.encode_rows(y.reshape(-1), None).reshape(*y.batch_size, self.num_features)
 
     @abstractmethod
@@ -37,7 +40,7 @@ class Encoder(nn.Module):
 
     def first_layers(
         self, y: TensorDictBase, rows: Tensor, layers: Sequence[nn.Linear], counts: Sequence[int]
-    ) -> tuple[list[Tensor], Tensor]:
+    ) -> list[tuple[Tensor, Tensor | None]]:
         """Outputs of several networks' first layers, each at rows of its own.
 
         Args:
@@ -47,10 +50,19 @@ class Encoder(nn.Module):
             counts: the first layer reads the first ``counts[0]`` of ``rows``, the second the next ``counts[1]``, ...
 
         Returns:
-            each layer's output, and the rows ``[M]`` that they belong to: ``rows``, reordered within each layer's.
+            each layer's output ``[P, H]`` and where in it the layer's rows are, int64 ``[count]``; None: they are all of it.
         """
         blocks = zip(layers, self.encode_rows(y, rows).split(list(counts)), strict=True)
-        return [rowwise(layer, features) for layer, features in blocks], rows
+        return [(rowwise(layer, features), None) for layer, features in blocks]
+
+
+# Offsets that differ by less than this fraction of the graph's size are the same: coordinates are rounded.
+_SAME = 1e-5
+
+
+def transformed(tensor: Tensor) -> bool:
+    """Whether a function transform such as ``vmap`` runs, under which the numbers of ``tensor`` cannot decide what is done."""
+    return torch._C._functorch.peek_interpreter_stack() is not None
 
 
 class FlatEncoder(Encoder):
@@ -69,7 +81,7 @@ class FlatEncoder(Encoder):
 
     def __init__(self, model: BeliefModel) -> None:
         super().__init__()
-        spec = model.state_spec()
+        spec = check_instance("model", model, BeliefModel).state_spec()
         self.keys = model.state_keys
         self.classes = {key: leaf.n if isinstance(leaf, Categorical) else None for key, leaf in spec.items()}
         self.num_features = sum(leaf.shape.numel() * (self.classes[key] or 1) for key, leaf in spec.items())
@@ -114,95 +126,144 @@ class RelativeEncoder(Encoder):
 
     def __init__(self, model: RepairModel) -> None:
         super().__init__()
+        check_instance("model", model, RepairModel)
         self.num_levels, self.num_locations, self.num_robots = model.num_levels, model.num_locations, model.num_robots
+        self.dtype = model.dtype
         size, levels = self.num_locations, self.num_levels
-        window = _window(model.graph)
+        offsets = _offsets(model.graph)
         # [L, L * K] for a robot at a location: which feature each number of the belief is; and the location's own.
-        columns = window.unsqueeze(-1) * levels + torch.arange(levels)
-        places = (int(window.max()) + 1) * levels + torch.arange(size)
-        self.register_buffer("columns", columns.flatten(1).to(model.device), persistent=False)
+        columns = (offsets.unsqueeze(-1) * levels + torch.arange(levels)).flatten(1)
+        places = (int(offsets.max()) + 1) * levels + torch.arange(size)
+        self.register_buffer("columns", columns.to(model.device), persistent=False)
         self.register_buffer("places", places.to(model.device), persistent=False)
         # On a line the features are neighbours, which saves a copy; the first one then.
-        ranges = (columns.flatten(1).diff() == 1).all(-1).tolist()
-        self._neighbouring = [int(row[0]) if range else None for row, range in zip(columns.flatten(1), ranges, strict=True)]
+        ranges = (columns.diff() == 1).all(-1).tolist()
+        self.neighbouring = [int(row[0]) if range else None for row, range in zip(columns, ranges, strict=True)]
         self.robot_features = int(places[-1]) + 1
         self.num_features = self.num_robots * self.robot_features
 
     def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
         """See :class:`Encoder`."""
-        numbers, location = self._numbers(y.get("belief"), rows), y.get("location")
-        location = location if rows is None else location[rows]
+        numbers, location = self.numbers(y.get("belief")), y.get("location")
+        return self.windows(numbers, location) if rows is None else self.windows(numbers[rows], location[rows])
+
+    def windows(self, numbers: Tensor, location: Tensor) -> Tensor:
+        """Features ``[M, F]`` of what is known of the locations, see :meth:`numbers`, by robots at ``location`` ``[M, R]``."""
         features = numbers.new_zeros(len(numbers), self.num_robots, self.robot_features)
-        features.scatter_(-1, self.columns[location], numbers.unsqueeze(1).expand(-1, self.num_robots, -1))
-        features.scatter_(-1, self.places[location].unsqueeze(-1), 1.0)
-        return features.flatten(1)
+        known = numbers[:, : self.columns.shape[1]].unsqueeze(1).expand(-1, self.num_robots, -1)
+        features = features.scatter(-1, self.columns[location], known)
+        return features.scatter(-1, self.places[location].unsqueeze(-1), 1.0).flatten(1)
+
+    def numbers(self, belief: Tensor) -> Tensor:
+        """What a window shows of every location of ``belief`` ``[N, L, K]``: ``[N, L * K]``, and zeros that align the rows."""
+        # A transposition of two dimensions is much faster than a general permutation.
+        planes = belief.permute(1, 2, 0).flatten(0, 1)
+        numbers = belief.new_zeros(len(belief), align_terms(len(planes)))
+        numbers[:, : len(planes)] = planes.T
+        numbers[:, : len(planes) : self.num_levels] = 1.0 - planes.T[:, :: self.num_levels].floor()
+        return numbers
+
+    def seen_from(self, place: int, weight: Tensor, count: int) -> Tensor:
+        """Those rows of the weights ``[F + count, H]`` that :meth:`numbers`, ``count`` of them, meet from a location."""
+        first = self.neighbouring[place]
+        if first is not None:
+            return weight.narrow(0, first, count)
+        return weight.index_select(0, nn.functional.pad(self.columns[place], (0, count - self.columns.shape[1])))
 
     def first_layers(
         self, y: TensorDictBase, rows: Tensor, layers: Sequence[nn.Linear], counts: Sequence[int]
-    ) -> tuple[list[Tensor], Tensor]:
-        """See :class:`Encoder`. Without gradients, on a CPU, the rows are grouped by location.
+    ) -> list[tuple[Tensor, Tensor | None]]:
+        """See :class:`Encoder`. On a CPU the rows are grouped by location.
 
         Robots at one location see the same offsets, the others' features are zero: a group is multiplied by the few rows of
         the weights that matter to it, and no window is ever made.
         """
-        if torch.is_grad_enabled() or rows.device.type != "cpu":
+        belief, location = y.get("belief"), y.get("location")
+        if rows.device.type != "cpu" or belief.requires_grad or transformed(belief):
             return super().first_layers(y, rows, layers, counts)
-        numbers, location = self._numbers(y.get("belief"), None), y.get("location")
-        outputs, ordered = [], []
-        for layer, own in zip(layers, rows.split(list(counts)), strict=True):
-            order = location[own, 0].argsort(stable=True)
-            own = own[order]
-            output = self._first_layer(numbers, own, location[own, 0], layer, 0)
-            for robot in range(1, self.num_robots):
-                order = location[own, robot].argsort(stable=True)
-                others = self._first_layer(numbers, own[order], location[own[order], robot], layer, robot)
-                output.index_add_(0, order, others)
-            outputs.append(output)
-            ordered.append(own)
-        return outputs, torch.cat(ordered)
-
-    def _first_layer(self, numbers: Tensor, rows: Tensor, location: Tensor, layer: nn.Linear, robot: int) -> Tensor:
-        """A robot's share of ``layer`` at ``rows`` ``[M]`` of ``numbers`` ``[N, L * K]``, sorted by ``location`` ``[M]``."""
-        # Small groups are multiplied together with rows of the next ones, whose own products then replace the result.
-        x = numbers.index_select(0, nn.functional.pad(rows, (0, _MIN_ROWS)))
-        weight = layer.weight.T[robot * self.robot_features :][: self.robot_features].contiguous()
-        bias = weight[self.places] if robot else weight[self.places] + layer.bias
-        output = x.new_empty(len(x), layer.out_features)
-        start = 0
-        for place, count in enumerate(location.bincount(minlength=self.num_locations).tolist()):
-            if count:
-                block = slice(start, start + max(count, _MIN_ROWS))
-                torch.addmm(bias[place], x[block], self._seen_from(place, weight), out=output[block])
-                start += count
-        return output[:start]
-
-    def _seen_from(self, place: int, weight: Tensor) -> Tensor:
-        """Those rows of the weights ``[F, H]`` that the belief meets from a location: ``[L * K, H]``."""
-        first = self._neighbouring[place]
-        size = self.num_locations * self.num_levels
-        return weight.index_select(0, self.columns[place]) if first is None else weight.narrow(0, first, size)
-
-    def _numbers(self, belief: Tensor, rows: Tensor | None) -> Tensor:
-        """What the windows show of the rows of ``belief`` ``[N, L, K]``: ``[M, L * K]``."""
-        # A transposition of two dimensions is much faster than a general permutation.
-        planes = belief.permute(1, 2, 0).flatten(0, 1)
-        numbers = planes.T.contiguous() if rows is None else planes.T.index_select(0, rows)
-        numbers = numbers.clone() if numbers.data_ptr() == belief.data_ptr() else numbers
-        numbers[:, :: self.num_levels] = 1.0 - numbers[:, :: self.num_levels].floor()
-        return numbers
+        numbers = self.numbers(belief)
+        return [
+            _WindowLayer.apply(layer.weight, layer.bias, self, numbers, location, own)
+            for layer, own in zip(layers, rows.split(list(counts)), strict=True)
+        ]
 
 
-def rowwise(network: nn.Module, features: Tensor) -> Tensor:
-    """``network`` on ``[*B, F]``, such that a row's output does not depend on the size of the batch."""
-    flat = features.reshape(-1, features.shape[-1])
-    missing = max(0, _MIN_ROWS - flat.shape[0])
-    output = network(nn.functional.pad(flat, (0, 0, 0, missing)) if missing else flat)
-    return output[: flat.shape[0]].reshape(*features.shape[:-1], output.shape[-1])
+class _WindowLayer(torch.autograd.Function):
+    """A linear layer on the windows of :class:`RelativeEncoder` at chosen rows, computed without them; the gradient with them.
+
+    Both with and without gradients the outputs are these, to the last bit.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, weight: Tensor, bias: Tensor, encoder: RelativeEncoder, numbers: Tensor, location: Tensor, rows: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        location = location[rows]
+        output, places = _robot_output(encoder, numbers, rows, location[:, 0], weight, bias, 0)
+        for robot in range(1, encoder.num_robots):
+            other, found = _robot_output(encoder, numbers, rows, location[:, robot], weight, None, robot)
+            output.index_add_(0, places, other.index_select(0, found))
+        ctx.encoder = encoder
+        ctx.save_for_backward(numbers, location, rows, places)
+        ctx.mark_non_differentiable(places)
+        return output, places
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, output: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        numbers, location, rows, places = ctx.saved_tensors
+        features = ctx.encoder.windows(numbers[rows], location)
+        output = output.index_select(0, places)
+        return output.T @ features, output.sum(0), None, None, None, None
 
 
-def _window(graph: Graph) -> Tensor:
-    """Number of the offset from every location to every location, ``[L, L]``: row by row, as a window centred at the first."""
-    column, row = graph.columns.round().to(torch.int64), graph.rows.round().to(torch.int64)
-    across, down = column - column.unsqueeze(-1), row - row.unsqueeze(-1)
-    width = int(across.max() - across.min()) + 1
-    return (down - down.min()) * width + across - across.min()
+def _robot_output(
+    encoder: RelativeEncoder,
+    numbers: Tensor,
+    rows: Tensor,
+    location: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    robot: int,
+) -> tuple[Tensor, Tensor]:
+    """A robot's share of a layer at ``rows`` ``[M]``, where it stands at ``location`` ``[M]``.
+
+    Rows of one location are neighbours, each location's filled up to a multiple of 16.
+
+    Returns:
+        outputs ``[P, H]``, and the places ``[M]`` of the rows among them.
+    """
+    groups = location.bincount(minlength=encoder.num_locations)
+    sizes = [align(count) if count else 0 for count in groups.tolist()]
+    starts = torch.tensor(sizes).cumsum(0) - torch.tensor(sizes)
+    order = location.argsort(stable=True)
+    within = torch.arange(len(rows)) - (groups.cumsum(0) - groups)[location[order]]
+    places = torch.empty_like(rows).index_copy_(0, order, starts[location[order]] + within)
+    source = rows.new_zeros(sum(sizes)).index_copy_(0, places, rows)
+    x = numbers.index_select(0, source)
+    wide = align(weight.shape[0])
+    own = weight.new_zeros(encoder.robot_features + numbers.shape[1], wide)
+    own[: encoder.robot_features, : weight.shape[0]] = weight.T[robot * encoder.robot_features :][: encoder.robot_features]
+    offset = own[encoder.places]
+    if bias is not None:
+        offset[:, : len(bias)] += bias
+    output = x.new_empty(len(x), wide)
+    for place, (start, size) in enumerate(zip(starts.tolist(), sizes, strict=True)):
+        if size:
+            block = slice(start, start + size)
+            affine(x[block], encoder.seen_from(place, own, x.shape[1]), offset[place], out=output[block])
+    # No view: what follows may overwrite it.
+    return output if wide == weight.shape[0] else output[:, : weight.shape[0]].contiguous(), places
+
+
+def _offsets(graph: Graph) -> Tensor:
+    """Number of the offset from every location to every location, ``[L, L]``, numbered row by row."""
+    across, down = (c.unsqueeze(0) - c.unsqueeze(1) for c in (graph.columns, graph.rows))
+    return (_ranks(down) * across.numel() + _ranks(across)).unique(return_inverse=True)[1]
+
+
+def _ranks(values: Tensor) -> Tensor:
+    """Numbers from the smallest on, those that differ by rounding alone being the same."""
+    ordered, inverse = values.double().unique(return_inverse=True)
+    larger = ordered.diff() > _SAME * float(ordered.abs().max().clamp_min(1.0))
+    return torch.nn.functional.pad(larger.cumsum(0), (1, 0))[inverse]

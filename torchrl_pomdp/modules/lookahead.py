@@ -9,15 +9,16 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_keys
 from torchrl_pomdp.envs.belief import BeliefModel, take_rows
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import CHUNK_ROWS, Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold
 
-__all__ = ["RolloutPolicy"]
+__all__ = ["RolloutPolicy", "cheapest", "check_q_factors", "spread"]
 
 _LEAVES, _ALLOCATIONS = ("control", "observation"), ("uniform", "adaptive")
 # Adaptive allocation: trajectories of the first and of every further round, and the standard errors that settle it.
@@ -58,8 +59,9 @@ class RolloutPolicy(TensorDictModuleBase):
         compile: see :class:`TruncatedRollout`.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if a number is not positive, or ``leaves`` or ``allocation`` is unknown; when called, if a state does
-            not fit the model.
+            not fit the model, if the base policy's first controls are illegal, or if a cost is not finite.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -89,13 +91,12 @@ class RolloutPolicy(TensorDictModuleBase):
         compile: bool = False,
     ) -> None:
         super().__init__()
-        if trajectories < 1:
-            raise ValueError(f"trajectories must be at least 1, got {trajectories}")
-        for name, given, known in (("leaves", leaves, _LEAVES), ("allocation", allocation, _ALLOCATIONS)):
-            if given not in known:
-                raise ValueError(f"{name} must be one of {known}, got {given!r}")
+        self.model = check_instance("model", model, BeliefModel)
         self.in_keys = list(model.state_keys)
-        self.model = model
+        self.trajectories = check_integer("trajectories", trajectories, 1, MAX_TRAJECTORIES)
+        self.leaves = check_choice("leaves", leaves, _LEAVES)
+        self.allocation = check_choice("allocation", allocation, _ALLOCATIONS)
+        self.seed = check_integer("seed", seed)
         self.cost_to_go = TruncatedRollout(
             model,
             base_policy,
@@ -105,7 +106,6 @@ class RolloutPolicy(TensorDictModuleBase):
             chunk_rows=chunk_rows,
             compile=compile,
         )
-        self.trajectories, self.leaves, self.allocation, self.seed = trajectories, leaves, allocation, seed
 
     @property
     def simulated_steps(self) -> int:
@@ -115,7 +115,7 @@ class RolloutPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"q_factors"`` ``[*B, U]`` (costs, ``+inf`` where illegal) and ``"action"`` ``[*B]`` (ties to the lower)."""
         q = self.q_factors(tensordict)
-        return tensordict.update({"action": q.argmin(-1), "q_factors": q})
+        return tensordict.update({"action": cheapest(q), "q_factors": q})
 
     def keys(self, y: TensorDictBase) -> Tensor:
         """Keys of the scenarios of feature states, int64 ``[*B]``: functions of seed and content."""
@@ -137,6 +137,8 @@ class RolloutPolicy(TensorDictModuleBase):
         leaves = self.model.num_controls * (self.model.num_observations if self.leaves == "observation" else 1)
         trajectories = leaves * max(self._rounds())
         size, threads = blocks(flat.shape[0], trajectories, self.cost_to_go.chunk_rows, self.model.device)
+        if keys is not None and check_keys("keys", keys).shape != y.batch_size:
+            raise ValueError(f"keys must be one for each state, {tuple(y.batch_size)}, got {tuple(keys.shape)}")
         keys = self.keys(flat) if keys is None else keys.reshape(-1)
         parts = list(zip(flat.split(size), keys.split(size), strict=True))
         return torch.cat(map_threads(lambda part: self._q_factors(*part), parts, threads)).view(shape)
@@ -144,7 +146,8 @@ class RolloutPolicy(TensorDictModuleBase):
     def _q_factors(self, y: TensorDictBase, keys: Tensor) -> Tensor:
         """Q-factors ``[N, U]`` of a flat batch with the keys ``[N]``."""
         mask, core = y.get("action_mask"), y.select(*self.model.state_keys)
-        costs = torch.full((self.trajectories, *mask.shape), torch.nan, dtype=self.model.dtype, device=mask.device)
+        costs = torch.zeros((self.trajectories, *mask.shape), dtype=self.model.dtype, device=mask.device)
+        made = torch.zeros_like(costs, dtype=torch.bool)
         rivals, spent = mask, 0
         for count in self._rounds():
             state, u = rivals.nonzero(as_tuple=True)
@@ -153,8 +156,11 @@ class RolloutPolicy(TensorDictModuleBase):
             members = spread(self.trajectories)[spent : spent + count].to(mask.device)
             spent += count
             costs[spent - count : spent, state, u] = self._trajectory_costs(core, state, u, members, keys)
+            made[spent - count : spent] = rivals
             rivals = _rivals(costs[:spent], rivals)
-        return _combine(costs, mask)
+        q = _combine(costs, made, mask)
+        check_q_factors(q, mask)
+        return q
 
     def _rounds(self) -> list[int]:
         """Numbers of trajectories of each control that are simulated one after the other."""
@@ -220,20 +226,48 @@ def _rivals(costs: Tensor, rivals: Tensor) -> Tensor:
     return left & (left.sum(-1, keepdim=True) > 1)
 
 
-def _combine(costs: Tensor, mask: Tensor) -> Tensor:
-    """Q-factors ``[N, U]`` from the costs ``[n, N, U]`` of the trajectories that were simulated (the others are NaN).
+def _combine(costs: Tensor, made: Tensor, mask: Tensor) -> Tensor:
+    """Q-factors ``[N, U]`` from the costs ``[n, N, U]`` of the trajectories that were ``made``; the others' are 0.
 
     A control that got fewer trajectories than the best one has the best one's Q-factor plus the mean difference of the
     trajectories that both have: the noise that they share cancels.
     """
-    made = ~costs.isnan()
     count = made.sum(0)
-    mean = (sum_first(costs.nan_to_num(0.0)) / count).masked_fill(~mask, torch.inf)
+    mean = (sum_first(costs.clone()) / count).masked_fill(~mask, torch.inf)
     most = count.amax(-1, keepdim=True)
     best = mean.masked_fill(count < most, torch.inf).argmin(-1, keepdim=True)
     reference = costs.gather(-1, best.expand(costs.shape[0], -1, 1))
-    gap = sum_first((costs - reference).nan_to_num(0.0)) / count
+    gap = sum_first((costs - reference).masked_fill(~made, 0.0)) / count
     return torch.where((count < most) & mask, mean.gather(-1, best) + gap, mean)
+
+
+def check_q_factors(q: Tensor, mask: Tensor) -> None:
+    """Raise unless the Q-factors ``[N, U]`` of all controls of ``mask`` are finite."""
+    wrong = mask & ~torch.isfinite(q)
+    if bool(wrong.any()):
+        state, u = wrong.nonzero()[0].tolist()
+        raise ValueError(
+            f"q_factors of legal controls must be finite, got {q[state, u].item()} for control {u} in state {state} of a "
+            f"batch: the model's costs overflow {q.dtype} or are no numbers"
+        )
+
+
+def cheapest(q: Tensor) -> Tensor:
+    """The control of the smallest Q-factor ``[*B]`` (ties to the lower) of Q-factors ``[*B, U]``.
+
+    Raises:
+        ValueError: if a state has no finite one, so that no legal control could be chosen.
+
+    Examples:
+        >>> cheapest(torch.tensor([[2.0, 1.0, 1.0]])).tolist()
+        [1]
+    """
+    if q.numel() == 0:
+        return torch.zeros(q.shape[:-1], dtype=torch.int64, device=q.device)
+    value, u = q.min(-1)
+    if not bool(torch.isfinite(value).all()):
+        raise ValueError("action_mask must allow at least one control in every state, got none")
+    return u
 
 
 def spread(count: int) -> Tensor:

@@ -7,8 +7,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief import inverse_cdf, take_rows
-from torchrl_pomdp.modules.lookahead import RolloutPolicy
+from torchrl_pomdp.modules.lookahead import RolloutPolicy, cheapest, check_q_factors
 from torchrl_pomdp.noise import fold, uniform
 
 __all__ = ["MultistepLookahead"]
@@ -37,7 +38,8 @@ class MultistepLookahead(TensorDictModuleBase):
             controls are expanded.
 
     Raises:
-        ValueError: if ``depth`` is not 1, 2 or 3, ``branches`` is not positive, or ``margin`` is negative.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if ``depth`` is not 1, 2 or 3, ``branches`` is not in 1 to 256, or ``margin`` not in [0, 1000].
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -52,19 +54,16 @@ class MultistepLookahead(TensorDictModuleBase):
 
     def __init__(self, policy: RolloutPolicy, depth: int = 2, branches: int = 5, margin: float | None = None) -> None:
         super().__init__()
-        if depth not in (1, 2, 3):
-            raise ValueError(f"depth must be 1, 2 or 3, got {depth}")
-        if branches < 1:
-            raise ValueError(f"branches must be at least 1, got {branches}")
-        if margin is not None and not margin >= 0.0:
-            raise ValueError(f"margin must not be negative, got {margin}")
-        self.policy, self.depth, self.branches, self.margin = policy, depth, branches, margin
+        self.policy = check_instance("policy", policy, RolloutPolicy)
+        self.depth = check_integer("depth", depth, 1, 3)
+        self.branches = check_integer("branches", branches, 1, _BLOCK)
+        self.margin = None if margin is None else check_number("margin", margin, "[0, 1000]")
         self.model, self.in_keys = policy.model, policy.in_keys
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"q_factors"`` ``[*B, U]``, see :meth:`q_factors`, and ``"action"`` ``[*B]`` (ties to the lower)."""
         q = self.q_factors(tensordict)
-        return tensordict.update({"action": q.argmin(-1), "q_factors": q})
+        return tensordict.update({"action": cheapest(q), "q_factors": q})
 
     @torch.no_grad()
     def q_factors(self, y: TensorDictBase) -> Tensor:
@@ -97,6 +96,7 @@ class MultistepLookahead(TensorDictModuleBase):
             total = total + term
         q = torch.full(mask.shape, torch.inf, dtype=value.dtype, device=value.device)
         q[state, u] = model.expected_cost(pairs, u) + model.discount * total
+        check_q_factors(q, mask)
         return q
 
     def _worthwhile(self, y: TensorDictBase, keys: Tensor) -> Tensor:

@@ -12,11 +12,14 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from torchrl_pomdp.checks import check_instance, check_integer, check_sizes
 from torchrl_pomdp.envs.belief import take_rows
-from torchrl_pomdp.modules.encoders import Encoder, rowwise
+from torchrl_pomdp.modules.encoders import Encoder, transformed
+from torchrl_pomdp.modules.rowwise import RowLinear, rowwise
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
+from torchrl_pomdp.tensor_checks import check_entries
 
-__all__ = ["LocalNetwork", "PolicyNetwork", "ValueNetwork", "evaluate_networks", "invert"]
+__all__ = ["LocalNetwork", "PolicyNetwork", "ValueNetwork", "evaluate_networks"]
 
 
 class LocalNetwork(TensorDictModuleBase):
@@ -35,15 +38,17 @@ class LocalNetwork(TensorDictModuleBase):
 
     def __init__(self, encoder: Encoder, sizes: Sequence[int], generator: torch.Generator) -> None:
         super().__init__()
+        check_instance("encoder", encoder, Encoder)
+        check_instance("generator", generator, torch.Generator)
         self.encoder = encoder
-        self.network = _relu_network([encoder.num_features, *sizes], generator)
+        self.network = _relu_network([encoder.num_features, *sizes], encoder.dtype, generator)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the ``out_keys`` for feature states ``[*B]``."""
-        flat = tensordict.select(*self.in_keys).reshape(-1)
+        flat = check_entries("tensordict", tensordict, self.in_keys).select(*self.in_keys).reshape(-1)
         rows = torch.arange(flat.batch_size[0], device=flat.device)
-        entries, rows = evaluate_networks([self], flat, rows, [rows.numel()])
-        return tensordict.update(entries[invert(rows)].reshape(tensordict.batch_size))
+        entries = evaluate_networks([self], flat, rows, [rows.numel()])
+        return tensordict.update(entries.reshape(tensordict.batch_size))
 
     @property
     def kind(self) -> tuple[Any, ...]:
@@ -81,14 +86,18 @@ class PolicyNetwork(LocalNetwork):
     def __init__(
         self, encoder: Encoder, num_controls: int, hidden: Sequence[int] = (256, 64), *, generator: torch.Generator
     ) -> None:
-        super().__init__(encoder, [*hidden, num_controls], generator)
+        num_controls = check_integer("num_controls", num_controls, 1, 1 << 20)
+        super().__init__(encoder, [*check_sizes("hidden", hidden), num_controls], generator)
         self.entry_keys = ["action_mask"]
         self.in_keys = [*encoder.keys, *self.entry_keys]
 
     def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
         """``"logits"`` and ``"action"``; see the class."""
         logits = output.masked_fill(~y.get("action_mask"), -torch.inf)
-        return TensorDict({"logits": logits, "action": logits.argmax(-1)}, y.batch_size)
+        best, action = logits.max(-1)
+        # One check for all: of NaN, of infinite logits, and of a state without a legal control.
+        _check_finite("logits", best)
+        return TensorDict({"logits": logits, "action": action}, y.batch_size)
 
 
 class ValueNetwork(LocalNetwork):
@@ -123,7 +132,8 @@ class ValueNetwork(LocalNetwork):
         *,
         generator: torch.Generator,
     ) -> None:
-        super().__init__(encoder, [*hidden, 1], generator)
+        check_instance("scale", scale, ClosedFormCost)
+        super().__init__(encoder, [*check_sizes("hidden", hidden), 1], generator)
         self.scale = scale
         self.in_keys = self.entry_keys = list(encoder.keys)
 
@@ -134,39 +144,44 @@ class ValueNetwork(LocalNetwork):
 
     def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
         """``"state_value"``; see the class."""
-        return TensorDict({"state_value": output.squeeze(-1) * self.scale.costs(y)}, y.batch_size)
+        value = output.squeeze(-1) * self.scale.costs(y)
+        _check_finite("state_value", value)
+        return TensorDict({"state_value": value}, y.batch_size)
 
 
 def evaluate_networks(
     networks: Sequence[LocalNetwork], y: TensorDictBase, rows: Tensor, counts: Sequence[int]
-) -> tuple[TensorDictBase, Tensor]:
-    """Entries of networks of one kind, each at rows of its own.
+) -> TensorDictBase:
+    """Entries ``[M]`` of networks of one kind, each at rows of its own.
 
     Args:
         networks: the networks, of the same :attr:`LocalNetwork.kind`.
         y: feature states ``[N]``.
         rows: int64 ``[M]``, numbers of rows of ``y``.
         counts: the first network is evaluated at the first ``counts[0]`` of ``rows``, the second at the next, ...
-
-    Returns:
-        entries ``[M]``, and the rows ``[M]`` that they belong to: ``rows``, reordered within each network's.
     """
-    first = [cast(nn.Linear, network.network[0]) for network in networks]
-    hidden, rows = networks[0].encoder.first_layers(y, rows, first, counts)
-    outputs = [rowwise(network.network[1:], block) for network, block in zip(networks, hidden, strict=True)]
-    return networks[0].entries(torch.cat(outputs), take_rows(y.select(*networks[0].entry_keys), rows)), rows
+    first = [cast(RowLinear, network.network[0]) for network in networks]
+    hidden = networks[0].encoder.first_layers(y, rows, first, counts)
+    outputs = []
+    for network, (block, places) in zip(networks, hidden, strict=True):
+        output = rowwise(network.network[1:], block)
+        outputs.append(output if places is None else output.index_select(0, places))
+    return networks[0].entries(torch.cat(outputs), take_rows(y.select(*networks[0].entry_keys), rows))
 
 
-def invert(order: Tensor) -> Tensor:
-    """The inverse of a permutation ``[M]``."""
-    return torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
+def _check_finite(name: str, values: Tensor) -> None:
+    if not transformed(values) and not bool(torch.isfinite(values).all()):
+        wrong = values[~torch.isfinite(values)][0].item()
+        raise ValueError(
+            f"{name} of a network must be finite, got {wrong}: a weight is no number, or the state has no legal control"
+        )
 
 
-def _relu_network(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequential:
+def _relu_network(sizes: Sequence[int], dtype: torch.dtype, generator: torch.Generator) -> nn.Sequential:
     """Linear layers of the given sizes with ReLU between them, PyTorch's default initialisation from ``generator``."""
     layers: list[nn.Module] = []
     for fan_in, fan_out in pairwise(sizes):
-        layer = nn.utils.skip_init(nn.Linear, fan_in, fan_out, device=generator.device)
+        layer = nn.utils.skip_init(RowLinear, fan_in, fan_out, device=generator.device, dtype=dtype)
         for parameter in layer.parameters():
             nn.init.uniform_(parameter, -(fan_in**-0.5), fan_in**-0.5, generator=generator)
         layers += [layer, nn.ReLU(inplace=True)]

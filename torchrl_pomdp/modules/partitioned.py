@@ -10,8 +10,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from torchrl_pomdp.checks import check_instance, shown
 from torchrl_pomdp.envs.belief import take_rows
-from torchrl_pomdp.modules.networks import LocalNetwork, evaluate_networks, invert
+from torchrl_pomdp.modules.networks import LocalNetwork, evaluate_networks
+from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["PartitionedPolicy", "PartitionedValue"]
 
@@ -23,52 +25,64 @@ class _Partitioned(TensorDictModuleBase):
     evaluated together: the batch is sorted by network and encoded once.
     """
 
-    def __init__(self, members: Sequence[TensorDictModuleBase]) -> None:
+    def __init__(self, name: str, members: Any) -> None:
+        if not isinstance(members, Sequence) and not isinstance(members, nn.ModuleList):
+            raise TypeError(f"{name} must be a sequence of modules, one for each part, got {shown(members)}")
+        if not len(members):
+            raise ValueError(f"{name} is empty: a partitioned module needs one local module for each part")
+        for part, member in enumerate(members):
+            check_instance(f"{name}[{part}]", member, TensorDictModuleBase)
         super().__init__()
-        distinct = dict.fromkeys(members)
-        kinds = {member.kind for member in distinct if isinstance(member, LocalNetwork)}
-        self._networks = [m for m in distinct if isinstance(m, LocalNetwork)] if len(kinds) == 1 else []
-        # Networks come last, so that their rows are neighbours once the batch is sorted.
-        self._others = [member for member in distinct if member not in self._networks]
-        numbers = {member: number for number, member in enumerate([*self._others, *self._networks])}
-        self.register_buffer("_member_of_part", torch.tensor([numbers[m] for m in members]), persistent=False)
-        read = {str(key): None for member in members for key in member.in_keys}
+        local: list[Any] = list(members)
+        read = {str(key): None for member in local for key in member.in_keys}
         self.in_keys = [*read, "partition"]
-        written = [set(member.out_keys) for member in members]
-        self.out_keys = [key for key in members[0].out_keys if all(key in keys for keys in written)]
+        written = [set(member.out_keys) for member in local]
+        self.out_keys = [key for key in local[0].out_keys if all(key in keys for keys in written)]
+        self._name = name
+        setattr(self, name, nn.ModuleList(members))
 
     # Which rows go where depends on the data, which a compiler cannot follow.
     @torch.compiler.disable
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the entries that all local modules write, for feature states ``[*B]``."""
-        part, parts = tensordict.get("partition").reshape(-1), self._member_of_part.numel()
-        if part.numel() and not 0 <= int(part.min()) <= int(part.max()) < parts:
-            raise ValueError(f"partition must hold parts 0..{parts - 1}, got {part.unique().tolist()}")
+        members = list(getattr(self, self._name))
+        check_instance("tensordict", tensordict, TensorDictBase)
+        part = tensordict.get("partition", None)
+        if part is None:
+            raise ValueError("tensordict lacks the entry 'partition': add it by model.with_features(y)")
+        check_entries("tensordict", tensordict, self.in_keys)
+        part = part.reshape(-1)
+        if part.numel() and not 0 <= int(part.min()) <= int(part.max()) < len(members):
+            raise ValueError(f"partition must hold parts 0..{len(members) - 1}, got {part.unique().tolist()}")
         flat = tensordict.select(*self.in_keys).reshape(-1)
-        if not self._networks and len(self._others) == 1:
-            result = self._others[0](flat).select(*self.out_keys)
-        else:
-            result = self._route(flat, self._member_of_part[part])
+        result = self._route(flat, part, members)
         return tensordict.update(result.reshape(tensordict.batch_size))
 
-    def _route(self, y: TensorDictBase, chosen: Tensor) -> TensorDictBase:
-        """Entries of the members number ``chosen`` ``[N]`` at the rows of ``y`` ``[N]``."""
+    def _route(self, y: TensorDictBase, part: Tensor, members: list[Any]) -> TensorDictBase:
+        """Entries at the rows of ``y`` ``[N]``, each by the member of its part ``[N]``."""
+        distinct = list(dict.fromkeys(members))
+        networks = [member for member in distinct if isinstance(member, LocalNetwork)]
+        networks = networks if len({network.kind for network in networks}) == 1 else []
+        if len(distinct) == 1 and not networks:
+            return distinct[0](y).select(*self.out_keys)
+        # Networks come last, so that their rows are neighbours once the batch is sorted.
+        others = [member for member in distinct if member not in networks]
+        numbers = {member: number for number, member in enumerate([*others, *networks])}
+        chosen = torch.tensor([numbers[member] for member in members], device=part.device)[part]
         order = chosen.argsort(stable=True)
-        counts = chosen.bincount(minlength=len(self._others) + len(self._networks)).tolist()
+        counts = chosen.bincount(minlength=len(distinct)).tolist()
         outputs = [
             member(take_rows(y, index)).select(*self.out_keys)
-            for member, index in zip(self._others, order.split(counts), strict=False)
+            for member, index in zip(others, order.split(counts), strict=False)
             if index.numel()
         ]
-        own = counts[len(self._others) :]
-        networks = [(network, count) for network, count in zip(self._networks, own, strict=True) if count]
-        if networks:
-            rest = order.numel() - sum(count for _, count in networks)
-            entries, rows = evaluate_networks([n for n, _ in networks], y, order[rest:], [count for _, count in networks])
-            order = torch.cat([order[:rest], rows])
+        present = [(network, count) for network, count in zip(networks, counts[len(others) :], strict=True) if count]
+        if present:
+            own = order[order.numel() - sum(count for _, count in present) :]
+            entries = evaluate_networks([network for network, _ in present], y, own, [count for _, count in present])
             outputs.append(entries.select(*self.out_keys))
         joined: Any = torch.cat(outputs, 0)
-        return joined[invert(order)]
+        return joined[torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))]
 
 
 class PartitionedPolicy(_Partitioned):
@@ -92,11 +106,10 @@ class PartitionedPolicy(_Partitioned):
         torch.Size([4])
     """
 
+    policies: nn.ModuleList
+
     def __init__(self, policies: Sequence[TensorDictModuleBase]) -> None:
-        if not policies:
-            raise ValueError("policies is empty: a partitioned policy needs one policy for each part")
-        super().__init__(policies)
-        self.policies = nn.ModuleList(policies)
+        super().__init__("policies", policies)
 
 
 class PartitionedValue(_Partitioned):
@@ -120,8 +133,7 @@ class PartitionedValue(_Partitioned):
         torch.Size([4])
     """
 
+    values: nn.ModuleList
+
     def __init__(self, values: Sequence[TensorDictModuleBase]) -> None:
-        if not values:
-            raise ValueError("values is empty: a partitioned value needs one value for each part")
-        super().__init__(values)
-        self.values = nn.ModuleList(values)
+        super().__init__("values", values)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_keys, shown
 from torchrl_pomdp.envs.belief import BeliefModel, put_rows, take_rows
 from torchrl_pomdp.modules.compiling import compiled
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.truncation import Truncation
 
-__all__ = ["Policy", "TerminalCost", "TruncatedRollout", "terminal_costs"]
+__all__ = ["MAX_STEPS", "MAX_TRAJECTORIES", "Policy", "TerminalCost", "TruncatedRollout", "terminal_costs"]
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 """A policy writes ``"action"``, int64 ``[*B]``, into a TensorDict of feature states; any TensorDictModule with that key."""
@@ -26,8 +27,12 @@ them as ``"state_value"`` ``[*B]`` (costs, lower is better). ``in_keys``, where 
 
 # Default of `chunk_rows`, wherever a rollout is made. No power of two: planes that lie so far apart compete for cache lines.
 CHUNK_ROWS = 16_000
+# Longest simulation and most trajectories of an estimate: there are tables of the one, and numbers of 24 bits for the other.
+MAX_STEPS, MAX_TRAJECTORIES = 1_000_000, 1 << 24
 # Discount of the first stage that is cut up to which its cost and the later ones' may be left out.
 _INSIGNIFICANT = 0.02
+# States at which the first controls of a policy are checked.
+_CHECKED = 256
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
 _RENEW_FRACTION = 0.15
 
@@ -40,15 +45,39 @@ def terminal_costs(terminal_cost: TerminalCost, y: TensorDictBase) -> Tensor:
         y: feature states ``[*B]`` with the entries that it reads; a TensorDictModule may write into it.
 
     Raises:
-        ValueError: if there are no costs or they have not the shape of the batch.
+        TypeError: if it gives no costs.
+        ValueError: if they have not the shape of the batch, or are not finite.
     """
     result = terminal_cost(y)
-    cost = result if isinstance(result, Tensor) else result.get("state_value", None)
-    if cost is None:
+    cost = result.get("state_value", None) if isinstance(result, TensorDictBase) else result
+    if cost is None and isinstance(result, TensorDictBase):
         raise ValueError("terminal_cost must return costs or write 'state_value', got a TensorDict without it")
+    if not isinstance(cost, Tensor) or not cost.is_floating_point():
+        raise TypeError(f"terminal_cost must return floating costs or write 'state_value', got {shown(cost)}")
     if cost.shape != y.batch_size:
         raise ValueError(f"terminal_cost must give costs of shape {tuple(y.batch_size)}, got {tuple(cost.shape)}")
+    check_finite("terminal_cost must give finite costs", cost)
     return cost
+
+
+def controls_of(name: str, policy: Policy, y: TensorDictBase) -> Tensor:
+    """The controls ``[*B]`` that a policy, called ``name`` in messages, writes at ``y`` ``[*B]``; it may write into ``y``.
+
+    Raises:
+        TypeError: if it returns no TensorDict with controls.
+    """
+    result = policy(y)
+    u = result.get("action", None) if isinstance(result, TensorDictBase) else None
+    if not isinstance(u, Tensor):
+        raise TypeError(f"{name} must write 'action' into a TensorDict and return it, got {shown(result)}")
+    return u
+
+
+def check_finite(rule: str, costs: Tensor) -> None:
+    """Raise the rule, and where it is broken, unless all costs are finite."""
+    if not bool(torch.isfinite(costs).all()):
+        where = tuple((~torch.isfinite(costs)).nonzero()[0].tolist())
+        raise ValueError(f"{rule}, got {costs[where].item()} at batch index {where}")
 
 
 class _Live(NamedTuple):
@@ -101,8 +130,10 @@ class TruncatedRollout(nn.Module):
         simulated_steps: belief steps made so far.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if ``max_steps`` or ``chunk_rows`` is not positive, if a cut needs a terminal cost and there is none, or if
-            the truncation rule does not fit the model; when called, if the terminal cost has the wrong shape.
+            the truncation rule does not fit the model; when called, if a state does not fit the model, if the policy's first
+            controls are illegal, or if a cost is not finite.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -140,25 +171,42 @@ class TruncatedRollout(nn.Module):
         compile: bool = False,
     ) -> None:
         super().__init__()
-        for name, value in (("max_steps", max_steps), ("chunk_rows", chunk_rows)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+        check_instance("model", model, BeliefModel)
+        check_callable("base_policy", base_policy)
+        max_steps = check_integer("max_steps", max_steps, 1, MAX_STEPS)
+        chunk_rows = check_integer("chunk_rows", chunk_rows, 1)
+        if truncation is not None:
+            check_instance("truncation", truncation, Truncation).check_model(model)
         if terminal_cost is None:
             _check_rest(model, max_steps, truncation)
-        if truncation is not None:
-            truncation.check_model(model)
+        else:
+            check_callable("terminal_cost", terminal_cost)
         self.model, self.base_policy, self.truncation = model, base_policy, truncation
         self.max_steps, self.terminal_cost, self.chunk_rows = max_steps, terminal_cost, chunk_rows
         # Features that are not read at every step are not computed at every step.
         self._keys = _read_by(base_policy)
         if self._keys and truncation is not None:
             self._keys += truncation.in_keys
+        self._compiled = check_flag("compile", compile)
+        powers = model.discount ** torch.arange(max_steps + 1, dtype=torch.float64)
+        self.register_buffer("_discounts", powers.to(model.device, model.dtype), persistent=False)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """What a copy does not take along, nor a file."""
         self.simulated_steps = 0
         # Several threads may share a rollout.
         self._lock = Lock()
-        powers = model.discount ** torch.arange(max_steps + 1, dtype=torch.float64)
-        self._transition = compiled(self._policy_and_step) if compile else self._policy_and_step
-        self.register_buffer("_discounts", powers.to(model.device, model.dtype), persistent=False)
+        self._transition = compiled(self._policy_and_step) if self._compiled else self._policy_and_step
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the lock, the compiled step and the count: a copy starts its own."""
+        return {key: value for key, value in self.__dict__.items() if key not in ("_lock", "_transition", "simulated_steps")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The inverse of :meth:`__getstate__`."""
+        super().__setstate__(state)
+        self._prepare()
 
     def forward(self, y: TensorDictBase, keys: Tensor | Scenarios, count: int = 1) -> Tensor:
         """Cost of one trajectory from every row.
@@ -171,10 +219,18 @@ class TruncatedRollout(nn.Module):
         Returns:
             costs ``[N]``.
         """
-        scenarios = keys if isinstance(keys, Scenarios) else Scenarios.single(keys)
+        self.model.check_state(y)
+        scenarios = keys if isinstance(keys, Scenarios) else Scenarios.single(check_keys("keys", keys))
+        if y.ndim != 1 or scenarios.keys.shape != y.batch_size:
+            raise ValueError(
+                f"keys must be one for each state of a flat batch, got shape {tuple(scenarios.keys.shape)} for states "
+                f"of batch {tuple(y.batch_size)}"
+            )
+        check_integer("count", count, 1, MAX_TRAJECTORIES)
         total = torch.zeros(y.batch_size, dtype=self.model.dtype, device=self.model.device)
         with torch.inference_mode():
             steps = self._simulate(y, scenarios, count, total)
+        check_finite("simulated costs must be finite", total)
         with self._lock:
             self.simulated_steps += steps
         return total
@@ -184,6 +240,7 @@ class TruncatedRollout(nn.Module):
         steps = 0
         size, waiting = y.batch_size[0], self.chunk_rows
         live = self._admit(y, scenarios, 0, waiting, total)
+        self._check_policy(live.y)
         while live.number.numel():
             ended = int(live.ended.sum())
             if ended <= _RENEW_FRACTION * live.ended.numel():
@@ -197,6 +254,12 @@ class TruncatedRollout(nn.Module):
             if waiting >= size:
                 live = live.rows(~live.ended)
         return steps
+
+    def _check_policy(self, y: TensorDictBase) -> None:
+        """Raise unless the policy's controls at some of the first states are legal; later ones are not looked at."""
+        rows = y[:_CHECKED].clone()
+        if rows.batch_size[0]:
+            self.model.check_controls(rows, controls_of("base_policy", self.base_policy, rows.copy()))
 
     def _admit(self, y: TensorDictBase, scenarios: Scenarios, first: int, last: int, total: Tensor) -> _Live:
         """The trajectories number ``first`` to ``last``, at their start."""
@@ -218,7 +281,7 @@ class TruncatedRollout(nn.Module):
         self, y: TensorDictBase, scenarios: Scenarios, age: Tensor, count: int
     ) -> tuple[Tensor, TensorDictBase, Scenarios]:
         """Discounted stage cost ``[N]``, next feature states and scenarios of rows that have made ``age`` ``[N]`` steps."""
-        u = self.base_policy(y).get("action")
+        u = controls_of("base_policy", self.base_policy, y)
         noise, scenarios = scenarios.draw(age, self.model.observed(y, u), count)
         cost, nxt = self.model.advance(y, u, noise)
         return cost * self._discounts[age], nxt, scenarios

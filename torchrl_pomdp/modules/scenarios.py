@@ -7,7 +7,7 @@ trajectory and the variable: in one scenario a location is found in much the sam
 gets there. Later observations of the same variable are tied to the step. All uniforms of a trajectory are independent.
 
 The trajectories of one estimate are stratified: their n uniforms for the first observation of a variable lie one in each of n
-equal slices of [0, 1), in an order that differs from variable to variable.
+equal slices of [0, 1), in a random order that is independent from variable to variable (a Latin hypercube).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_pomdp.noise import uniform
+from torchrl_pomdp.noise import fold, permuted, uniform
 
 __all__ = ["Scenarios"]
 
@@ -89,11 +89,21 @@ class Scenarios(NamedTuple):
             bit = _bit(name)
             first, seen = (self.seen & bit) == 0, seen | bit
             noise = uniform(self.keys, torch.where(first, name, _STEPS + age * robots + robot))
-            if count > 1:
-                slice_ = (self.members + (uniform(self.groups, name) * count).to(torch.int64)) % count
-                noise = torch.where(first, ((slice_ + noise) / count).clamp_max(_LARGEST), noise)
-            columns.append(noise)
+            columns.append(self._stratified(noise, first, name, count) if count > 1 else noise)
         return torch.stack(columns, -1), self._replace(seen=seen)
+
+    def _stratified(self, noise: Tensor, first: Tensor, name: Tensor, count: int) -> Tensor:
+        """``noise`` ``[N]``, within the trajectory's slice where it is the ``first`` observation of its variable."""
+        if torch.compiler.is_compiling():
+            # Which rows these are depends on the data, which a compiler cannot follow.
+            return torch.where(first, _within_slice(noise, self.groups, self.members, name, count), noise)
+        rows = first.nonzero().squeeze(-1)
+        inside = _within_slice(noise[rows], self.groups[rows], self.members[rows], name[rows], count)
+        return noise.index_copy(0, rows, inside)
+
+
+def _within_slice(noise: Tensor, groups: Tensor, members: Tensor, name: Tensor, count: int) -> Tensor:
+    return ((permuted(fold(groups, name), members, count) + noise) / count).clamp_max(_LARGEST)
 
 
 def _bit(name: Tensor) -> Tensor:

@@ -9,11 +9,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from torchrl_pomdp.checks import check_callable, check_instance, check_integer, shown
 from torchrl_pomdp.envs.belief import BeliefModel, take_rows
 from torchrl_pomdp.envs.partition import location_costs
 from torchrl_pomdp.envs.repair import RepairModel
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import CHUNK_ROWS, Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
@@ -30,6 +31,7 @@ class ClosedFormCost(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"state_value"`` ``[*B]``."""
+        check_instance("tensordict", tensordict, TensorDictBase)
         return tensordict.set("state_value", self.costs(tensordict))
 
     @abstractmethod
@@ -48,7 +50,7 @@ class ZeroCost(ClosedFormCost):
 
     def costs(self, y: TensorDictBase) -> Tensor:
         """Zeros ``[*B]`` of the belief's type."""
-        return y.get("belief").new_zeros(y.batch_size)
+        return _belief(y).new_zeros(y.batch_size)
 
 
 class SteadyStateCost(ClosedFormCost):
@@ -67,10 +69,11 @@ class SteadyStateCost(ClosedFormCost):
 
     def __init__(self, model: RepairModel) -> None:
         super().__init__()
-        self.model = model
+        self.model = check_instance("model", model, RepairModel)
 
     def costs(self, y: TensorDictBase) -> Tensor:
         """Costs ``[*B]``."""
+        _belief(y)
         return self.model.expected_cost(y) / (1.0 - self.model.discount)
 
 
@@ -90,7 +93,7 @@ class NeverRepairCost(ClosedFormCost):
 
     def __init__(self, model: RepairModel) -> None:
         super().__init__()
-        chain = model.chain.double()
+        chain = check_instance("model", model, RepairModel).chain.double()
         system = torch.eye(model.num_levels, dtype=chain.dtype, device=chain.device) - model.discount * chain
         # Discounted cost of one location that starts at each level.
         self.level_costs = tuple(torch.linalg.solve(system, model.costs.double()).tolist())
@@ -98,7 +101,17 @@ class NeverRepairCost(ClosedFormCost):
     def costs(self, y: TensorDictBase) -> Tensor:
         """Costs ``[*B]``."""
         # Planes [L, K, *B] are summed in the same order whatever the batch.
-        return sum_first(location_costs(y.get("belief").movedim((-2, -1), (0, 1)), self.level_costs))
+        belief = _belief(y)
+        if belief.shape[y.ndim + 1 :] != (len(self.level_costs),):
+            raise ValueError(f"entry 'belief' of y must end in {len(self.level_costs)} levels, got {tuple(belief.shape)}")
+        return sum_first(location_costs(belief.movedim((-2, -1), (0, 1)), self.level_costs))
+
+
+def _belief(y: TensorDictBase) -> Tensor:
+    belief = check_instance("y", y, TensorDictBase).get("belief", None)
+    if not isinstance(belief, Tensor) or not belief.is_floating_point():
+        raise ValueError(f"y must hold the beliefs as entry 'belief', got {shown(belief)}")
+    return belief
 
 
 class PolicyCost(TensorDictModuleBase):
@@ -121,8 +134,9 @@ class PolicyCost(TensorDictModuleBase):
         chunk_rows: see :class:`TruncatedRollout`; on a CPU each of ``torch.get_num_threads()`` threads has such a chunk.
 
     Raises:
+        TypeError: if an argument is of the wrong kind.
         ValueError: if a number is not positive, or by :class:`TruncatedRollout`; when called, if a state does not fit the
-            model.
+            model, or by :class:`TruncatedRollout`.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -149,14 +163,14 @@ class PolicyCost(TensorDictModuleBase):
         chunk_rows: int = CHUNK_ROWS,
     ) -> None:
         super().__init__()
-        if trajectories < 1:
-            raise ValueError(f"trajectories must be at least 1, got {trajectories}")
+        self.model = check_instance("model", model, BeliefModel)
         self.in_keys = list(model.state_keys)
-        self.model = model
+        self.trajectories = check_integer("trajectories", trajectories, 1, MAX_TRAJECTORIES)
+        self.seed = check_integer("seed", seed)
+        check_callable("policy", policy)
         self.rollout = TruncatedRollout(
             model, policy, max_steps=max_steps, truncation=truncation, terminal_cost=terminal_cost, chunk_rows=chunk_rows
         )
-        self.trajectories, self.seed = trajectories, seed
 
     @property
     def simulated_steps(self) -> int:
@@ -165,6 +179,7 @@ class PolicyCost(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"cost_to_go"`` ``[*B]``."""
+        check_instance("tensordict", tensordict, TensorDictBase)
         return tensordict.set("cost_to_go", self.costs(tensordict))
 
     @torch.no_grad()

@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_pomdp.checks import check_instance, check_integer, shown
 from torchrl_pomdp.envs.belief import BeliefModel
 
 __all__ = ["AfterSteps", "OnEntering", "OnLeaving", "Truncation"]
@@ -51,6 +52,7 @@ class Truncation(ABC):
         Raises:
             ValueError: if the model lacks a feature or a part that the rule names.
         """
+        check_instance("model", model, BeliefModel)
         features = list(map(str, model.feature_spec().keys()))
         missing = [key for key in self.in_keys if key not in features]
         if missing:
@@ -69,6 +71,7 @@ class AfterSteps(Truncation):
             all features, that gives it for each, int64 ``[N]``: the paper's state-dependent m.
 
     Raises:
+        TypeError: if m is neither.
         ValueError: if m is negative; at the start of a trajectory, if the function gives anything but such numbers.
 
     Examples:
@@ -78,16 +81,14 @@ class AfterSteps(Truncation):
     """
 
     def __init__(self, m: int | Callable[[TensorDictBase], Tensor]) -> None:
-        if not callable(m) and m < 0:
-            raise ValueError(f"m must be at least 0, got {m}")
-        self.m = m
+        self.m = m if callable(m) else check_integer("m", m, 0, 1 << 62)
         self.width = int(callable(m))
 
     def start(self, y: TensorDictBase) -> Tensor:
         """The state-dependent m ``[N, 1]``; nothing ``[N, 0]`` where m is a number."""
         if not callable(self.m):
             return super().start(y)
-        steps = self.m(y)
+        steps = check_instance("m(y)", self.m(y), Tensor)
         if steps.shape != y.batch_size or steps.dtype != torch.int64:
             raise ValueError(f"m must give int64 {tuple(y.batch_size)}, got {steps.dtype} {tuple(steps.shape)}")
         if bool((steps < 0).any()):
@@ -108,6 +109,7 @@ class OnEntering(Truncation):
         parts: numbers of the parts, at least one.
 
     Raises:
+        TypeError: if ``parts`` holds anything but integers.
         ValueError: if ``parts`` is empty or has a negative number; when given to a rollout, if the model has no such part.
 
     Examples:
@@ -120,9 +122,11 @@ class OnEntering(Truncation):
     in_keys = ("partition",)
 
     def __init__(self, parts: Iterable[int]) -> None:
-        self.parts = tuple(sorted(set(parts)))
-        if not self.parts or self.parts[0] < 0:
-            raise ValueError(f"parts must hold at least one part and none below 0, got {self.parts}")
+        if isinstance(parts, str) or not isinstance(parts, Iterable):
+            raise TypeError(f"parts must be numbers of parts, got {shown(parts)}")
+        self.parts = tuple(sorted({check_integer("parts", part, 0) for part in parts}))
+        if not self.parts:
+            raise ValueError("parts must hold at least one part, got none")
 
     def stop(self, y: TensorDictBase, age: Tensor, memory: Tensor) -> Tensor:
         """Where the state is in one of the parts."""

@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_pomdp.objectives.labels import LabelLoss
+from torchrl_pomdp.checks import check_choice, check_instance
+from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of
 
 __all__ = ["ClassificationLoss"]
 
@@ -39,7 +40,9 @@ class ClassificationLoss(LabelLoss):
         (mean gap of the chosen control, a cost).
 
     Raises:
-        ValueError: if ``loss`` is unknown.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if ``loss`` is unknown; by ``forward``, if a label is missing, illegal or no number, or the loss is not
+            finite.
 
     Examples:
         >>> import torch
@@ -67,9 +70,8 @@ class ClassificationLoss(LabelLoss):
 
     def __init__(self, policy: TensorDictModuleBase, loss: LossName = "soft") -> None:
         super().__init__()
-        if loss not in _LOSSES:
-            raise ValueError(f"loss must be one of {sorted(_LOSSES)}, got {loss!r}")
-        self.loss = loss
+        check_instance("policy", policy, TensorDictModuleBase)
+        self.loss = check_choice("loss", loss, _LOSSES)
         self.convert_to_functional(policy, "policy")
 
     @property
@@ -80,26 +82,33 @@ class ClassificationLoss(LabelLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss and metrics of labelled states ``[*B]``; see the class."""
-        batch = tensordict.reshape(-1)
+        batch = check_batch(tensordict, self.in_keys)
+        label = label_of(batch, self.tensor_keys.action, 1, floating=False)
+        gaps = _gaps(label_of(batch, self.tensor_keys.q_factors, 2, floating=True), label)
         with self.policy_params.to_module(self.policy, preserve_module_state=False):
             output = self.policy(batch.select(*self.policy.in_keys))
         logits = output.get("logits")
-        label = batch.get(self.tensor_keys.action)
-        gaps = _gaps(batch.get(self.tensor_keys.q_factors))
+        if logits.shape != gaps.shape:
+            raise ValueError(f"q_factors must have the logits' shape {tuple(logits.shape)}, got {tuple(gaps.shape)}")
         chosen = logits.detach().argmax(-1)
         return TensorDict(
             {
-                "loss_policy": _LOSSES[self.loss](logits, label, gaps).mean(),
+                "loss_policy": check_loss("loss_policy", _LOSSES[self.loss](logits, label, gaps).mean()),
                 "accuracy": (chosen == label).to(logits.dtype).mean(),
                 "regret": gaps.gather(-1, chosen.unsqueeze(-1)).mean(),
             }
         )
 
 
-def _gaps(q_factors: Tensor) -> Tensor:
-    """Q-factors minus their smallest, zero where illegal."""
-    gaps = q_factors - q_factors.amin(-1, keepdim=True)
-    return gaps.masked_fill(~torch.isfinite(gaps), 0.0)
+def _gaps(q_factors: Tensor, label: Tensor) -> Tensor:
+    """Q-factors ``[N, U]`` minus their smallest, zero where illegal; the labels ``[N]`` must be legal."""
+    illegal = q_factors == torch.inf
+    gaps = (q_factors - q_factors.amin(-1, keepdim=True)).masked_fill(illegal, 0.0)
+    if not bool(torch.isfinite(gaps).all()):
+        raise ValueError("q_factors must be finite, or +inf where a control is illegal, and not overflow; got others")
+    if not bool(((label >= 0) & (label < q_factors.shape[-1])).all()) or bool(illegal.gather(-1, label.unsqueeze(-1)).any()):
+        raise ValueError("action must be a legal control, one with a finite Q-factor, got another")
+    return gaps
 
 
 def _l2(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:

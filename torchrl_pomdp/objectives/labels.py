@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import fields
 
+import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.objectives import LossModule
 
-__all__ = ["LabelLoss"]
+from torchrl_pomdp.checks import shown
+from torchrl_pomdp.tensor_checks import check_entries
+
+__all__ = ["LabelLoss", "check_batch", "check_loss", "label_of"]
 
 
 class LabelLoss(LossModule):
@@ -31,3 +38,35 @@ class LabelLoss(LossModule):
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
         pass
+
+
+def check_batch(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> TensorDictBase:
+    """Labelled states ``[*B]`` with entries ``keys`` as a flat batch that is not empty."""
+    batch = check_entries("tensordict", tensordict, keys).reshape(-1)
+    if batch.batch_size[0] == 0:
+        raise ValueError("tensordict must hold at least one labelled state, got none")
+    return batch
+
+
+def label_of(batch: TensorDictBase, key: NestedKey, ndim: int, floating: bool) -> Tensor:
+    """The labels ``key`` of a flat batch.
+
+    Raises:
+        ValueError: if they are missing or of another shape or kind.
+    """
+    label, kind = batch.get(key), "floating" if floating else "int64"
+    fits = label.is_floating_point() if floating else label.dtype == torch.int64
+    if label.ndim != ndim or not fits:
+        raise ValueError(f"{key!r} must hold {kind} labels of {ndim} dimensions, got {label.dtype} and {shown(label)}")
+    return label
+
+
+def check_loss(name: str, loss: Tensor) -> Tensor:
+    """The loss, if it is a number.
+
+    Raises:
+        ValueError: if it is not finite.
+    """
+    if not bool(torch.isfinite(loss)):
+        raise ValueError(f"{name} must be finite, got {float(loss)}: a label, or an output of the network, is no number")
+    return loss

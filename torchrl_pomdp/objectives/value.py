@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 
+from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.modules import ClosedFormCost
-from torchrl_pomdp.objectives.labels import LabelLoss
+from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of
 
 __all__ = ["ValueLoss"]
 
@@ -18,14 +20,19 @@ class ValueLoss(LabelLoss):
     r"""Mean squared error of a cost approximation :math:`\hat J(y,r)` against simulated costs, relative to a scale.
 
     Costs-to-go span many orders of magnitude; divided by a known positive cost of the state, such as that of never
-    repairing, the errors of cheap and of expensive states count alike.
+    repairing, the errors of cheap and of expensive states count alike. States of scale zero, such as terminal ones, where there
+    is nothing to learn, are left out.
 
     Args:
         value: module that writes ``"state_value"``; a :class:`~torchrl_pomdp.modules.ValueNetwork` or a partitioned one.
-        scale: positive cost of a state that its error is divided by.
+        scale: cost of a state, not negative, that its error is divided by.
 
     Returns (by ``forward``):
-        TensorDict with scalars ``loss_value`` and ``relative_error`` (mean absolute error over mean target).
+        TensorDict with scalars ``loss_value`` and ``relative_error`` (mean absolute error over mean target, 0 where all is 0).
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: by ``forward``, if a label is missing or no number, a scale is negative, or the loss is not finite.
 
     Examples:
         >>> import torch
@@ -52,7 +59,8 @@ class ValueLoss(LabelLoss):
 
     def __init__(self, value: TensorDictModuleBase, scale: ClosedFormCost) -> None:
         super().__init__()
-        self.scale = scale
+        check_instance("value", value, TensorDictModuleBase)
+        self.scale = check_instance("scale", scale, ClosedFormCost)
         self.convert_to_functional(value, "value")
 
     @property
@@ -63,15 +71,20 @@ class ValueLoss(LabelLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss and metrics of labelled states ``[*B]``; see the class."""
-        batch = tensordict.reshape(-1)
+        batch = check_batch(tensordict, self.in_keys)
+        target = label_of(batch, self.tensor_keys.cost_to_go, 1, floating=True)
         with self.value_params.to_module(self.value, preserve_module_state=False):
             value = self.value(batch.select(*self.value.in_keys)).get("state_value")
-        target = batch.get(self.tensor_keys.cost_to_go)
-        error = value - target
-        relative = error / self.scale.costs(batch)
+        scale = self.scale.costs(batch)
+        if not bool((scale >= 0).all()):
+            raise ValueError(f"scale must give costs that are not negative, got {float(scale.min())} among them")
+        known = scale > 0
+        error = (value - target).masked_fill(~known, 0.0)
+        relative = error / scale.masked_fill(~known, 1.0)
+        count, total = known.sum().clamp_min(1), target.masked_fill(~known, 0.0).abs().sum()
         return TensorDict(
             {
-                "loss_value": relative.square().mean(),
-                "relative_error": error.detach().abs().mean() / target.mean(),
+                "loss_value": check_loss("loss_value", relative.square().sum() / count),
+                "relative_error": error.detach().abs().sum() / torch.where(total > 0, total, 1.0),
             }
         )

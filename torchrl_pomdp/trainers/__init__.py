@@ -1,12 +1,15 @@
 """Policy iteration and the paper's algorithms (Sections IV to VI)."""
 
+from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.architecture import make_networks, make_values
-from torchrl_pomdp.trainers.config import PolicyIterationConfig
+from torchrl_pomdp.trainers.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from torchrl_pomdp.trainers.parts import PartRecord, train_part
-from torchrl_pomdp.trainers.policy_iteration import Evaluate, Improve, Iteration, PolicyIteration
+from torchrl_pomdp.trainers.plan import Evaluate, Improve
+from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
 from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt, r_t
 
 __all__ = [
+    "Checkpoint",
     "Evaluate",
     "Improve",
     "Iteration",
@@ -14,11 +17,13 @@ __all__ = [
     "PolicyIteration",
     "PolicyIterationConfig",
     "api",
+    "load_checkpoint",
     "make_networks",
     "make_values",
     "papi_nt",
     "papi_t",
     "r_nt",
     "r_t",
+    "save_checkpoint",
     "train_part",
 ]

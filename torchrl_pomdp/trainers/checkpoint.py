@@ -1,47 +1,76 @@
-"""Files of a run: whole or absent, loaded without unpickling, never overwritten by another run."""
+"""Files of a run: a policy with all that is needed to use it, loaded without unpickling; the folder that belongs to one run."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
 
+from torchrl_pomdp.checks import check_choice, check_device, check_flag, check_instance, check_integer, check_path, check_text
+from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.presets import PRESETS, Problem, make_problem
-from torchrl_pomdp.files import claim, load_tensors, save_tensors
+from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, parse_tensors, tensor_bytes, write_bytes
+from torchrl_pomdp.identity import digest
 from torchrl_pomdp.modules import NeverRepairCost, PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
-from torchrl_pomdp.trainers.architecture import make_networks, make_values
-from torchrl_pomdp.trainers.config import PolicyIterationConfig
+from torchrl_pomdp.trainers.architecture import BASE_POLICIES, ENCODERS, make_networks, make_values, partition_of
 
-__all__ = ["Checkpoint", "load_checkpoint", "open_run_folder", "save_checkpoint"]
+__all__ = ["Checkpoint", "load_checkpoint", "open_run_folder", "problem_digest", "save_checkpoint"]
 
-_FORMAT = "torchrl_pomdp policy 2"
+_FORMAT = "torchrl_pomdp policy 3"
+# What a checkpoint's JSON text holds.
+_ABOUT = {
+    "format", "problem", "partitioned", "problem_digest", "config", "algorithm", "iteration", "base", "value_parts",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A trained policy with all that is needed to use it.
+    """A policy with all that is needed to use it.
 
     Attributes:
         problem: the problem it was trained on, with its partition.
         config: how it was trained.
         algorithm: name of the algorithm, such as pAPI-NT.
-        iteration: number of the policy iteration that made it, from 1.
-        policy: the partitioned policy.
+        iteration: number of the policy iteration that made it, from 1; 0 for a base policy, the best one where no iteration
+            was accepted.
+        policy: the partitioned policy, or the base policy.
         value: the partitioned terminal cost; never repairing in the parts without a value network.
+
+    Raises:
+        TypeError: if something is of the wrong kind.
+        ValueError: if ``algorithm`` is no text that can be shown, or ``iteration`` is negative.
     """
 
     problem: Problem
     config: PolicyIterationConfig
     algorithm: str
     iteration: int
-    policy: PartitionedPolicy
+    policy: TensorDictModuleBase
     value: PartitionedValue
 
+    def __post_init__(self) -> None:
+        check_instance("checkpoint.problem", self.problem, Problem)
+        check_instance("checkpoint.config", self.config, PolicyIterationConfig)
+        check_text("checkpoint.algorithm", self.algorithm)
+        check_integer("checkpoint.iteration", self.iteration, 0)
+        check_instance("checkpoint.policy", self.policy, TensorDictModuleBase)
+        check_instance("checkpoint.value", self.value, PartitionedValue)
 
-def open_run_folder(path: Path, identity: dict[str, Any]) -> Path:
+    @property
+    def name(self) -> str:
+        """What tables call the policy: algorithm and iteration, or the name of the base policy."""
+        return _base_name(self.policy, self.problem) or f"{self.algorithm} {self.iteration}"
+
+
+def open_run_folder(path: str | PathLike[str], identity: dict[str, Any]) -> Path:
     """Make the folder of a run, or open it again to go on with the same run.
 
     Args:
@@ -49,7 +78,9 @@ def open_run_folder(path: Path, identity: dict[str, Any]) -> Path:
         identity: all that decides the run's results, as JSON; kept in ``config.json``.
 
     Raises:
+        TypeError: if ``path`` is no path.
         ValueError: if the folder is in use and not by this very run; nothing in it is touched.
+        OSError: if it cannot be written.
 
     Examples:
         >>> import tempfile
@@ -58,6 +89,7 @@ def open_run_folder(path: Path, identity: dict[str, Any]) -> Path:
         ...     open_run_folder(path, {"seed": 0}) == path
         True
     """
+    path = check_path("path", path)
     record = path / "config.json"
     # What a kill in the middle of writing the record leaves has its name after a dot.
     in_use = path.exists() and (not path.is_dir() or any(not file.name.startswith(".config.") for file in path.iterdir()))
@@ -67,35 +99,48 @@ def open_run_folder(path: Path, identity: dict[str, Any]) -> Path:
     return path
 
 
-def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint: one file of tensors and a JSON text.
+def problem_digest(problem: Problem) -> str:
+    """What a problem is, whatever it is called: model with partition, start states, training states.
+
+    Examples:
+        >>> problem_digest(make_problem("line3")) == problem_digest(make_problem("line3", partitioned=False))
+        False
+    """
+    return digest((problem.model, problem.start, problem.training))
+
+
+def save_checkpoint(path: str | PathLike[str], checkpoint: Checkpoint) -> None:
+    """Write a checkpoint: one file of tensors and a JSON text; equal checkpoints give equal bytes.
 
     Args:
         path: file to make or replace, atomically.
-        checkpoint: the policy and its provenance; the problem must be a preset.
+        checkpoint: the policy and its provenance. The problem must be a preset; the policy a network in every part, as the
+            configuration describes it, or one of the base policies by name.
 
     Raises:
-        ValueError: if the problem is no preset, or a part's policy is not a network.
+        TypeError: if ``path`` is no path or ``checkpoint`` no checkpoint.
+        ValueError: if what is given could not be loaded again; nothing is written.
+        OSError: if the file cannot be written.
     """
-    if checkpoint.problem.name not in PRESETS:
-        raise ValueError(f"checkpoint.problem must be one of {', '.join(sorted(PRESETS))}, got {checkpoint.problem.name!r}")
-    others = [type(p).__name__ for p in checkpoint.policy.policies if not isinstance(p, PolicyNetwork)]
-    if others:
-        raise ValueError(f"checkpoint.policy must have a PolicyNetwork in every part, got {others[0]}")
-    about = {
-        "format": _FORMAT,
-        "problem": checkpoint.problem.name,
-        "partitioned": checkpoint.problem.partitioned,
-        "config": asdict(checkpoint.config),
-        "algorithm": checkpoint.algorithm,
-        "iteration": checkpoint.iteration,
-        "value_parts": [part for part, value in enumerate(checkpoint.value.values) if isinstance(value, ValueNetwork)],
-    }
-    policy, value = checkpoint.policy.state_dict(), checkpoint.value.state_dict()
-    save_tensors(path, {"about": json.dumps(about), "policy": policy, "value": value})
+    path = check_path("path", path)
+    check_instance("checkpoint", checkpoint, Checkpoint)
+    _check_preset(checkpoint.problem)
+    saved = tensor_bytes(_content(checkpoint))
+    try:
+        loaded = _parse(parse_tensors(saved, path), checkpoint.problem.model.device)
+    except ValueError as error:
+        raise ValueError(f"checkpoint could not be loaded again: {error}") from error
+    for name in ("policy", "value"):
+        given = getattr(checkpoint, name)
+        if digest(_locals(getattr(loaded, name))) != digest(_locals(given)):
+            raise ValueError(
+                f"checkpoint.{name} must be what checkpoint.problem and checkpoint.config describe, "
+                f"got another {type(given).__name__}: it could not be loaded"
+            )
+    write_bytes(path, saved)
 
 
-def load_checkpoint(path: Path, *, device: torch.device | str = "cpu") -> Checkpoint:
+def load_checkpoint(path: str | PathLike[str], *, device: torch.device | str = "cpu") -> Checkpoint:
     """Read a checkpoint back; tensors and JSON only, nothing is unpickled.
 
     Args:
@@ -103,7 +148,10 @@ def load_checkpoint(path: Path, *, device: torch.device | str = "cpu") -> Checkp
         device: where the policy and its problem are put.
 
     Raises:
-        ValueError: if there is no such file, or it is damaged or of another kind.
+        TypeError: if ``path`` is no path.
+        DamagedFileError: a ``ValueError``, if the file is not as it was written, of another kind, or of a problem that has
+            changed since.
+        ValueError: if there is no such file or no such device.
 
     Examples:
         >>> import tempfile
@@ -115,24 +163,152 @@ def load_checkpoint(path: Path, *, device: torch.device | str = "cpu") -> Checkp
         ...     load_checkpoint(path).problem.name
         'line3'
     """
+    path, device = check_path("path", path), check_device("device", device)
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path}")
+    content = load_tensors(path)
     try:
-        content = load_tensors(path, device)
-        about = json.loads(content["about"])
-        if about["format"] != _FORMAT:
-            raise ValueError(f"its format is {about['format']!r}, expected {_FORMAT!r}")
-        for name in ("hidden", "value_hidden"):
-            about["config"][name] = tuple(about["config"][name])
-        config = PolicyIterationConfig(**about["config"])
-        problem = make_problem(about["problem"], partitioned=about["partitioned"], device=device)
-        policy = make_networks(problem, config, seed=0)
-        policy.load_state_dict(content["policy"])
-        networks = make_values(problem, config, seed=0).values
-        closed_form = NeverRepairCost(problem.model)
-        trained = about["value_parts"]
-        value = PartitionedValue([v if part in trained else closed_form for part, v in enumerate(networks)])
-        value.load_state_dict(content["value"])
-    except Exception as error:  # torch.load raises whatever a foreign file happens to trigger
-        raise ValueError(f"{path} is damaged or no checkpoint of this library: {error}") from error
+        return _parse(content, device)
+    except Exception as error:  # what a foreign file holds can be anything
+        raise DamagedFileError(f"{path} is damaged or no checkpoint of this library: {error}") from error
+
+
+def _check_preset(problem: Problem) -> None:
+    """Raise unless the problem is what :func:`make_problem` makes of its name."""
+    if problem.name not in PRESETS:
+        raise ValueError(f"checkpoint.problem must be one of {', '.join(sorted(PRESETS))}, got {problem.name!r}")
+    if problem_digest(problem) != problem_digest(make_problem(problem.name, partitioned=problem.partitioned)):
+        raise ValueError(f"checkpoint.problem must be the preset {problem.name}, got another problem of that name")
+
+
+def _check_networks(policy: TensorDictModuleBase) -> None:
+    if not isinstance(policy, PartitionedPolicy):
+        names = ", ".join(BASE_POLICIES)
+        raise ValueError(
+            f"checkpoint.policy must be a PartitionedPolicy of networks, or one of {names} as it is by name, "
+            f"got another {type(policy).__name__}"
+        )
+    others = [type(local).__name__ for local in policy.policies if not isinstance(local, PolicyNetwork)]
+    if others:
+        raise ValueError(f"checkpoint.policy must have a PolicyNetwork in every part, got {others[0]}")
+
+
+def _content(checkpoint: Checkpoint) -> dict[str, Any]:
+    """A checkpoint as plain dictionaries of tensors and texts, with their digest."""
+    base = _base_name(checkpoint.policy, checkpoint.problem)
+    if base is None:
+        _check_networks(checkpoint.policy)
+    parts = [part for part, value in enumerate(checkpoint.value.values) if isinstance(value, ValueNetwork)]
+    about = {
+        "format": _FORMAT,
+        "problem": checkpoint.problem.name,
+        "partitioned": checkpoint.problem.partitioned,
+        "problem_digest": problem_digest(checkpoint.problem),
+        "config": asdict(checkpoint.config),
+        "algorithm": checkpoint.algorithm,
+        "iteration": checkpoint.iteration,
+        "base": base and {"name": base, "digest": digest(checkpoint.policy)},
+        "value_parts": parts,
+    }
+    content = {
+        "about": json.dumps(about),
+        "policy": _tensors(checkpoint.policy) if base is None else {},
+        "value": _tensors(checkpoint.value),
+    }
+    return {**content, "digest": digest(content)}
+
+
+def _base_name(policy: TensorDictModuleBase, problem: Problem) -> str | None:
+    """Name of a base policy; None for any other policy."""
+    own = digest(policy)
+    return next((name for name, make in BASE_POLICIES.items() if digest(make(problem.model)) == own), None)
+
+
+def _locals(module: TensorDictModuleBase) -> list[Any]:
+    """What a policy or value is made of; whether parts share an encoder or a scale changes nothing but speed."""
+    if isinstance(module, PartitionedPolicy):
+        return list(module.policies)
+    return list(module.values) if isinstance(module, PartitionedValue) else [module]
+
+
+def _tensors(module: nn.Module) -> dict[str, Tensor]:
+    """Parameters as they are kept: none is a view of another, on no device in particular."""
+    state = module.state_dict()
+    return {name: state[name].detach().cpu().clone(memory_format=torch.contiguous_format) for name in sorted(state)}
+
+
+def _parse(content: Any, device: torch.device) -> Checkpoint:
+    """The checkpoint that a file's content stands for; a ``ValueError`` or ``TypeError`` where it stands for none."""
+    if not isinstance(content, dict) or not isinstance(content.get("about"), str):
+        raise ValueError("it holds no description")
+    about = json.loads(content["about"])
+    if not isinstance(about, dict) or about.get("format") != _FORMAT:
+        raise ValueError(f"its format is {about.get('format') if isinstance(about, dict) else None!r}, expected {_FORMAT!r}")
+    if set(about) != _ABOUT or set(content) != {"about", "policy", "value", "digest"}:
+        raise ValueError("its entries are not those of a checkpoint")
+    # A tensor of many numbers can be a view of few: what is read must be as large as it says.
+    for tensors in (content["policy"], content["value"]):
+        if not isinstance(tensors, dict) or not all(isinstance(t, Tensor) and t.is_contiguous() for t in tensors.values()):
+            raise ValueError("its weights are no plain tensors")
+    if content["digest"] != digest({name: content[name] for name in ("about", "policy", "value")}):
+        raise ValueError("its content does not agree with its digest")
+    config = PolicyIterationConfig(**check_instance("config", about["config"], dict))
+    name = check_choice("problem", about["problem"], sorted(PRESETS))
+    problem = make_problem(name, partitioned=check_flag("partitioned", about["partitioned"]), device=device)
+    if about["problem_digest"] != problem_digest(problem):
+        raise ValueError(f"problem {name} is not what it was when the checkpoint was made")
+    policy = _parse_base(about["base"], problem, content) or _parse_policy(problem, config, content["policy"])
+    value = _parse_value(problem, config, content["value"], about["value_parts"])
     return Checkpoint(problem, config, about["algorithm"], about["iteration"], policy.eval(), value.eval())
+
+
+def _parse_base(base: Any, problem: Problem, content: dict[str, Any]) -> TensorDictModuleBase | None:
+    if base is None:
+        return None
+    check_instance("base", base, dict)
+    name = check_choice("base", base.get("name"), BASE_POLICIES)
+    policy = BASE_POLICIES[name](problem.model)
+    if base.get("digest") != digest(policy) or content["policy"] != {}:
+        raise ValueError(f"base policy {name} is not what it was when the checkpoint was made")
+    return policy
+
+
+def _parse_policy(problem: Problem, config: PolicyIterationConfig, tensors: Any) -> PartitionedPolicy:
+    sizes = [ENCODERS[config.encoder](problem.model).num_features, *config.hidden, problem.model.num_controls]
+    _check_tensors("policies", tensors, range(partition_of(problem).num_parts), sizes, problem.model.dtype)
+    policy = make_networks(problem, config, seed=0)
+    policy.load_state_dict(tensors)
+    return policy
+
+
+def _parse_value(problem: Problem, config: PolicyIterationConfig, tensors: Any, trained: Any) -> PartitionedValue:
+    parts = partition_of(problem).num_parts
+    check_instance("value_parts", trained, list)
+    if any(check_integer("value_parts", part, 0, parts - 1) != part for part in trained) or len(set(trained)) < len(trained):
+        raise ValueError(f"value_parts must hold different parts, got {trained}")
+    sizes = [ENCODERS[config.encoder](problem.model).num_features, *config.value_hidden, 1]
+    _check_tensors("values", tensors, trained, sizes, problem.model.dtype)
+    never = NeverRepairCost(problem.model)
+    networks = make_values(problem, config, seed=0).values if trained else ()
+    value = PartitionedValue([networks[part] if part in trained else never for part in range(parts)])
+    value.load_state_dict(tensors)
+    return value
+
+
+def _check_tensors(
+    name: str, tensors: dict[str, Tensor], parts: Sequence[int], sizes: Sequence[int], dtype: torch.dtype
+) -> None:
+    """Raise unless the tensors are the finite weights of networks of these sizes, before any network is made."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for part in parts:
+        for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
+            shapes[f"{name}.{part}.network.{2 * layer}.weight"] = (fan_out, fan_in)
+            shapes[f"{name}.{part}.network.{2 * layer}.bias"] = (fan_out,)
+    if set(tensors) != set(shapes):
+        raise ValueError(f"its {name} are not networks of sizes {sizes} in parts {list(parts)}")
+    for key, shape in shapes.items():
+        tensor = tensors[key]
+        if tensor.shape != shape or tensor.dtype != dtype:
+            raise ValueError(f"{key} must have shape {shape} and type {dtype}, got {tuple(tensor.shape)} and {tensor.dtype}")
+        if not bool(torch.isfinite(tensor).all()):
+            raise ValueError(f"{key} holds numbers that are not finite")

@@ -14,9 +14,10 @@ from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDic
 from torchrl.objectives import LossModule
 from torchrl.record.loggers import Logger
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
-from tqdm import tqdm
 
-from torchrl_pomdp.trainers.config import PolicyIterationConfig
+from torchrl_pomdp.checks import check_flag, check_instance, check_seed, check_text
+from torchrl_pomdp.config import PolicyIterationConfig
+from torchrl_pomdp.progress import progress_bar
 
 __all__ = ["PartRecord", "train_part"]
 
@@ -71,7 +72,19 @@ def train_part(
 
     Returns:
         seconds, and the means of the loss module's outputs over the last tenth of the optimisation steps.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if there are no states, or a loss is not finite.
     """
+    check_instance("batch", batch, TensorDictBase)
+    check_instance("loss", loss, LossModule)
+    check_instance("config", config, PolicyIterationConfig)
+    seed, name, progress = check_seed("seed", seed), check_text("name", name), check_flag("progress", progress)
+    if logger is not None:
+        check_instance("logger", logger, Logger)
+    if batch.ndim != 1 or batch.batch_size[0] == 0:
+        raise ValueError(f"batch must hold labelled states [N], at least one, got batch {tuple(batch.batch_size)}")
     size = batch.batch_size.numel()
     steps = max(config.least_steps, config.epochs * size // config.batch_size)
     optimizer = torch.optim.RMSprop(loss.parameters(), config.learning_rate)
@@ -129,7 +142,7 @@ class _Stepper(DefaultOptimizationStepper):
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         if self.count == 0:
-            self.bar = tqdm(total=self.steps, unit="step", desc=f"train {self.name}", disable=not self.progress, leave=False)
+            self.bar = progress_bar(self.steps, "step", f"train {self.name}", self.progress)
         # The trainer averages them over all steps; with their graphs it would keep every step's memory.
         losses = super().step(trainer, sub_batch).detach()
         self.schedule.step()

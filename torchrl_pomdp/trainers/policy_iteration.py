@@ -24,12 +24,17 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.record.loggers import Logger
 
+from torchrl_pomdp import __version__
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_path
 from torchrl_pomdp.collectors import OnLabels, PartSampler, PolicyEvaluation, RolloutImprovement, StateMemory, training_states
-from torchrl_pomdp.envs.belief import BeliefEnv
+from torchrl_pomdp.config import PolicyIterationConfig
+from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.envs.symmetry import symmetries
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.files import claim, load_tensors, save_tensors
+from torchrl_pomdp.files import claim
+from torchrl_pomdp.identity import digest, identity
+from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import (
     Encoder,
     NeverRepairCost,
@@ -38,48 +43,21 @@ from torchrl_pomdp.modules import (
     PolicyCost,
     PolicyNetwork,
     RolloutPolicy,
-    Truncation,
 )
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.objectives import ClassificationLoss, ValueLoss
 from torchrl_pomdp.trainers.architecture import ENCODERS, make_networks, make_values, partition_of
-from torchrl_pomdp.trainers.config import PolicyIterationConfig
+from torchrl_pomdp.trainers.logs import clear_log
 from torchrl_pomdp.trainers.parts import PartRecord, train_part
+from torchrl_pomdp.trainers.plan import Evaluate, Improve, Step, checked_plan
 
-__all__ = ["Evaluate", "Improve", "Iteration", "PolicyIteration", "Step"]
+__all__ = ["Iteration", "PolicyIteration"]
 
+# The record of whose folder it is.
+_RECORD = "policy-iteration.json"
 # What seeds are for; an iteration's validation is the same for all iterations.
 _PURPOSES = ("weights", "states", "labels", "batches", "visits", "validation")
-
-
-@dataclass(frozen=True)
-class Improve:
-    """Step of a plan: teach the policy networks of some parts the rollout control of the current policy.
-
-    Attributes:
-        parts: the parts, which are trained independently of each other.
-        truncation: rule that cuts the simulations; the current values are the terminal cost. None: no truncation.
-    """
-
-    parts: tuple[int, ...]
-    truncation: Truncation | None = None
-
-
-@dataclass(frozen=True)
-class Evaluate:
-    """Step of a plan: teach the value networks of some parts the cost of the current (global) policy.
-
-    Attributes:
-        parts: the parts, which are trained independently of each other.
-        truncation: as for :class:`Improve`.
-    """
-
-    parts: tuple[int, ...]
-    truncation: Truncation | None = None
-
-
-Step = Improve | Evaluate
 
 
 @dataclass(frozen=True)
@@ -109,8 +87,9 @@ class PolicyIteration:
     r"""Policy iteration from a base policy: its iterations, and the best policy so far. To iterate again is to start anew.
 
     An iteration starts from the best policy so far. Its policy is accepted if, on fixed validation states and under the same
-    noise, its mean cost is lower with 95 % confidence; a rejected one is dropped, and the next iteration tries again with other
-    training states, those where the rejected one went among them. The value networks are those of the best policy, too.
+    noise, the mean of its costs' paired differences is negative with 95 % confidence; a rejected one is dropped, and the next
+    iteration tries again with other training states, those where the rejected one went among them. The value networks are
+    those of the best policy, too.
 
     With a ``folder`` every trained part and every block of labels is kept there as soon as it is there. The same iteration
     with the same folder goes on where an earlier one was interrupted, and gives the same result.
@@ -128,8 +107,11 @@ class PolicyIteration:
         on_labels: called as states are labelled, with their number and whether an interrupted run had labelled them.
 
     Raises:
-        ValueError: if the problem's model has no partition or the plan is empty; when iterated, if the folder holds a run with
-            another problem, configuration, plan or kind of base policy.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if the problem's model has no partition, or the plan is empty or names a part that is none; when iterated,
+            if the folder holds a run that differs in the content of its problem, its configuration, plan or base policy, or
+            in the library's version.
+        FileNotFoundError: when iterated, if the folder is deleted meanwhile.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -154,12 +136,14 @@ class PolicyIteration:
         progress: bool = False,
         on_labels: OnLabels | None = None,
     ) -> None:
-        self.partition = partition_of(problem)
-        if not plan:
-            raise ValueError("plan is empty: an iteration needs at least one step")
-        self.problem, self.config, self.base_policy, self.plan = problem, config, base_policy, tuple(plan)
-        self.folder, self.logger, self.progress = folder, logger, progress
-        self.on_labels = on_labels
+        self.partition = partition_of(check_instance("problem", problem, Problem))
+        self.problem, self.config = problem, check_instance("config", config, PolicyIterationConfig)
+        self.base_policy = check_instance("base_policy", base_policy, TensorDictModuleBase)
+        self.plan = checked_plan(plan, problem)
+        self.folder = None if folder is None else check_path("folder", folder)
+        self.logger = None if logger is None else check_instance("logger", logger, Logger)
+        self.progress = check_flag("progress", progress)
+        self.on_labels = None if on_labels is None else check_callable("on_labels", on_labels)
         self._scale = NeverRepairCost(problem.model)
         self._symmetries = symmetries(problem.model)[: None if config.symmetries else 1]
         self._encoder = _shared_encoder(base_policy) or ENCODERS[config.encoder](problem.model)
@@ -176,7 +160,9 @@ class PolicyIteration:
         """Carry out the iterations, in order."""
         self._start()
         if self.folder is not None:
-            claim(self.folder / "policy-iteration.json", self._identity())
+            record = self._identity()
+            claim(self.folder / _RECORD, record)
+            self._owner = digest(record)
         policy = self.best
         best_costs = self._validate(policy, "base policy")
         for number in range(1, self.config.iterations + 1):
@@ -191,10 +177,18 @@ class PolicyIteration:
             yield Iteration(number, policy, PartitionedValue(values).eval(), accepted, reason, comparison, records)
 
     def _identity(self) -> dict[str, Any]:
-        """What decides the results, as JSON."""
-        plan = [[type(s).__name__, s.parts, type(s.truncation).__name__ if s.truncation else None] for s in self.plan]
-        base = type(self.base_policy).__name__
-        return {"problem": self.problem.name, "base_policy": base, "plan": plan, "config": asdict(self.config)}
+        """What decides the results, as JSON: names for people, digests of the content for certainty."""
+        problem = self.problem
+        return {
+            "version": __version__,
+            "problem": problem.name,
+            "model": identity(problem.model),
+            "start": identity(problem.start),
+            "training": [identity(generator) for generator in problem.training],
+            "base_policy": identity(self.base_policy),
+            "plan": [[type(s).__name__, s.parts, None if s.truncation is None else identity(s.truncation)] for s in self.plan],
+            "config": asdict(self.config),
+        }
 
     def _iterate(self, number: int) -> tuple[list[Any], list[Any], dict[str, PartRecord]]:
         """The local policies and values after one iteration from the best policy."""
@@ -224,13 +218,14 @@ class PolicyIteration:
         seed = self._seed(number, "weights", part, index)
         if isinstance(step, Improve):
             return cast(LocalNetwork, make_networks(self.problem, self.config, seed, self._encoder).policies[part])
-        return cast(LocalNetwork, make_values(self.problem, self.config, seed, self._encoder).values[part])
+        return cast(LocalNetwork, make_values(self.problem, self.config, seed, self._encoder, self._scale).values[part])
 
     def _restore(self, networks: dict[int, LocalNetwork], name: str) -> dict[str, PartRecord] | None:
         """Load the networks of a step where an interrupted run has trained them; None where it has not."""
-        if self.folder is None or not (self.folder / f"{name}.pt").is_file():
+        path = self._path(name)
+        content = None if path is None else kept(path, f"{self._owner} {name}", self.problem.model.device)
+        if content is None:
             return None
-        content = load_tensors(self.folder / f"{name}.pt", self.problem.model.device)
         for part, network in networks.items():
             network.load_state_dict(content["networks"][str(part)])
         records = {key: PartRecord(**record) for key, record in json.loads(content["records"]).items()}
@@ -245,13 +240,15 @@ class PolicyIteration:
         step, name = self.plan[index], self._name(number, index)
         while self._unvisited:
             self._visit(*self._unvisited.pop(0))
-        cache = self.folder / f"{name}.labels" if self.folder is not None else None
+        path = self._path(name)
+        cache = path.with_suffix(".labels") if path is not None else None
         make = partial(self._collector, index, PartitionedPolicy(local), PartitionedValue(values), number, cache)
         collectors = {part: make(part) for part in step.parts}
         labelled: dict[int, Any] = {part: next(iter(collector)) for part, collector in collectors.items()}
         images = self._images(labelled)
         records = {}
         for part, network in networks.items():
+            clear_log(self.logger, f"{name}-part-{part}")
             seconds, losses = train_part(
                 images[part],
                 ClassificationLoss(network, self.config.loss) if isinstance(step, Improve) else ValueLoss(network, self._scale),
@@ -265,12 +262,24 @@ class PolicyIteration:
             records[f"{name}-part-{part}"] = PartRecord(
                 labelled[part].shape[0], collector.simulated_steps, collector.seconds, seconds, losses
             )
-        if self.folder is not None and cache is not None:
+        if path is not None and cache is not None:
             states = {str(part): network.state_dict() for part, network in networks.items()}
             content = {"networks": states, "records": json.dumps({key: r.to_dict() for key, r in records.items()})}
-            save_tensors(self.folder / f"{name}.pt", content)
+            self._check_folder()
+            keep(path, f"{self._owner} {name}", content)
             shutil.rmtree(cache, ignore_errors=True)
         return records
+
+    def _path(self, name: str) -> Path | None:
+        """File of a step's networks; None where nothing is kept."""
+        return None if self.folder is None else self.folder / f"{name}.pt"
+
+    def _check_folder(self) -> None:
+        """Raise if the folder is no longer the one that this run has claimed."""
+        if self.folder is not None and not (self.folder / _RECORD).is_file():
+            raise FileNotFoundError(
+                f"run folder {self.folder} was deleted or moved while the run went on: delete what is left and start again"
+            )
 
     def _images(self, labelled: dict[int, Any]) -> dict[int, TensorDictBase]:
         """For every part, the labelled states and mirror images of labelled states that lie in it."""
@@ -341,17 +350,18 @@ class PolicyIteration:
         """A seed for one purpose of one part in one iteration, another one each time that the plan comes to the part."""
         turn, parts = sum(part in step.parts for step in self.plan[:index]), self.partition.num_parts
         slot = (self.config.seed * 1000 + iteration) * max(100, parts * len(self.plan)) + turn * parts + part
-        return slot * len(_PURPOSES) + _PURPOSES.index(purpose)
+        return (slot * len(_PURPOSES) + _PURPOSES.index(purpose)) % 2**63
 
 
 def _judge(comparison: Comparison) -> tuple[bool, str]:
-    """Whether a policy is accepted against the best one so far, and why."""
-    low, high = comparison.ratio.interval
-    accepted = high < 1.0
+    """Whether a policy is accepted against the best one so far, and why; costs may be negative."""
+    low, high = comparison.difference.interval
+    accepted = high < 0.0
     verdict = "lower" if accepted else "not lower with confidence"
+    ratio = "" if comparison.ratio is None else f", {comparison.ratio.mean:.4f} times it"
     return accepted, (
-        f"cost {verdict}: {comparison.ratio.mean:.4f} ({low:.4f} … {high:.4f}) times that of the best policy so far, "
-        f"on {comparison.ratio.count} validation states"
+        f"cost {verdict}: {comparison.difference.mean:+.4g} ({low:+.4g} … {high:+.4g}) against the best policy so far{ratio}, "
+        f"on {comparison.cost.count} validation states"
     )
 
 

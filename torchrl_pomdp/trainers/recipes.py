@@ -20,10 +20,13 @@ from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
+from torchrl_pomdp.checks import check_instance
+from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.modules import OnEntering, PartitionedPolicy, RolloutPolicy, TerminalCost, Truncation
-from torchrl_pomdp.trainers.config import PolicyIterationConfig
-from torchrl_pomdp.trainers.policy_iteration import Evaluate, Improve, PolicyIteration
+from torchrl_pomdp.trainers.architecture import partition_of
+from torchrl_pomdp.trainers.plan import Evaluate, Improve
+from torchrl_pomdp.trainers.policy_iteration import PolicyIteration
 
 __all__ = ["api", "papi_nt", "papi_t", "r_nt", "r_t"]
 
@@ -44,7 +47,7 @@ def r_nt(problem: Problem, base_policy: TensorDictModuleBase, **options: Any) ->
         >>> r_nt(problem, GreedyRepair(problem.model))(problem.start(torch.arange(2)))["action"].shape
         torch.Size([2])
     """
-    return RolloutPolicy(problem.model, base_policy, **options)
+    return RolloutPolicy(check_instance("problem", problem, Problem).model, base_policy, **options)
 
 
 def r_t(problem: Problem, base_policy: TensorDictModuleBase, terminal_cost: TerminalCost, **options: Any) -> PartitionedPolicy:
@@ -97,8 +100,8 @@ def papi_nt(
         >>> [step.parts for step in papi_nt(problem, PolicyIterationConfig(), UrgencyRepair(problem.model)).plan]
         [(3, 4, 5), (0, 1, 2)]
     """
-    stages = problem.model.partition.stages if problem.model.partition is not None else ()
-    return PolicyIteration(problem, config, base_policy, [Improve(stage) for stage in stages], **options)
+    plan = [Improve(stage) for stage in _stages(problem)]
+    return PolicyIteration(problem, config, base_policy, plan, **options)
 
 
 def papi_t(
@@ -134,9 +137,13 @@ def papi_t(
     return PolicyIteration(problem, config, base_policy, plan, **options)
 
 
+def _stages(problem: Problem) -> tuple[tuple[int, ...], ...]:
+    return partition_of(check_instance("problem", problem, Problem)).stages
+
+
 def _cut_stages(problem: Problem, algorithm: str) -> list[tuple[tuple[int, ...], Truncation | None]]:
     """The partition's stages, each with the rule that cuts its simulations where they enter an earlier one."""
-    stages = problem.model.partition.stages if problem.model.partition is not None else ()
+    stages = _stages(problem)
     if len(stages) < 2:
         raise ValueError(f"{algorithm} needs a partition of at least two stages, problem {problem.name!r} has {len(stages)}")
     earlier = [sum(stages[:number], ()) for number in range(len(stages))]
@@ -162,9 +169,8 @@ def api(problem: Problem, config: PolicyIterationConfig, base_policy: TensorDict
         >>> [step.parts for step in api(problem, PolicyIterationConfig(), UrgencyRepair(problem.model)).plan]
         [(0,)]
     """
-    partition = problem.model.partition
-    if partition is None or partition.num_parts != 1:
-        parts = 0 if partition is None else partition.num_parts
+    parts = partition_of(check_instance("problem", problem, Problem)).num_parts
+    if parts != 1:
         raise ValueError(
             f"API is for a problem with a single part, {problem.name!r} has {parts}: make it with partitioned=False"
         )

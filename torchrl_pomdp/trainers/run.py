@@ -5,34 +5,42 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl import logger as torchrl_logger
 from torchrl.record import CSVLogger
 
+from torchrl_pomdp import __version__
+from torchrl_pomdp.checks import (
+    check_callable,
+    check_choice,
+    check_device,
+    check_flag,
+    check_instance,
+    check_integer,
+    check_path,
+)
 from torchrl_pomdp.collectors import OnLabels
-from torchrl_pomdp.envs import Problem, make_problem
+from torchrl_pomdp.config import EVALUATION_SEED, PolicyIterationConfig
+from torchrl_pomdp.envs import PRESETS, Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.files import load_tensors, save_tensors, write_json
-from torchrl_pomdp.modules import GreedyRepair, NeverRepairCost, Policy, UrgencyRepair
-from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, save_checkpoint
-from torchrl_pomdp.trainers.config import PolicyIterationConfig
-from torchrl_pomdp.trainers.policy_iteration import Iteration
+from torchrl_pomdp.files import DamagedFileError, load_tensors, save_tensors, write_json
+from torchrl_pomdp.identity import digest
+from torchrl_pomdp.modules import NeverRepairCost, PartitionedValue, Policy
+from torchrl_pomdp.trainers.architecture import BASE_POLICIES, partition_of
+from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
+from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
 from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt, r_t
 
-__all__ = ["ALGORITHMS", "BASE_POLICIES", "EVALUATION_SEED", "TrainingRun"]
+__all__ = ["ALGORITHMS", "TrainingRun"]
 
 ALGORITHMS = {"pAPI-NT": papi_nt, "pAPI-T": papi_t, "API": api}
 """The algorithms that learn, by name."""
-
-BASE_POLICIES: dict[str, Callable[..., TensorDictModuleBase]] = {"greedy": GreedyRepair, "urgency": UrgencyRepair}
-"""The base policies by name; made from the model."""
-
-# Start states of evaluations are drawn under this seed, whatever the training's.
-EVALUATION_SEED = 20200
 
 Report = Callable[[str, Comparison], None]
 
@@ -40,6 +48,10 @@ Report = Callable[[str, Comparison], None]
 @dataclass(frozen=True)
 class TrainingRun:
     """What decides the results of a training run.
+
+    Raises:
+        TypeError: if something is of the wrong kind; the message names it.
+        ValueError: if a name is unknown or a number out of range; the message names it.
 
     Examples:
         >>> import tempfile
@@ -72,17 +84,33 @@ class TrainingRun:
     online_trajectories: int = 10
     """Simulated trajectories of each control in online rollout."""
 
+    def __post_init__(self) -> None:
+        check_choice("problem", self.problem, sorted(PRESETS))
+        check_choice("algorithm", self.algorithm, ALGORITHMS)
+        check_choice("base", self.base, BASE_POLICIES)
+        check_instance("config", self.config, PolicyIterationConfig)
+        check_integer("states", self.states, 1, 10**9)
+        check_integer("online_states", self.online_states, 0, 10**9)
+        check_integer("online_trajectories", self.online_trajectories, 1, 10**6)
+
     def make_problem(self, device: torch.device | str = "cpu") -> Problem:
-        """The problem, partitioned as the algorithm needs it."""
+        """The problem, partitioned as the algorithm needs it; a ``ValueError`` if there is no such device."""
+        device = check_device("device", device)
         return make_problem(self.problem, partitioned=self.algorithm != "API", device=device)
 
-    def costs(self, folder: Path, policies: Iterable[str]) -> dict[str, Tensor]:
-        """Costs by evaluated policy, from the start states of the evaluation, of a run that was carried out in ``folder``."""
-        return {name: load_tensors(_costs_file(folder, name)) for name in policies}
+    def costs(self, folder: str | PathLike[str], policies: Iterable[str]) -> dict[str, Tensor]:
+        """Costs by evaluated policy, from the start states of the evaluation, of a run that was carried out in ``folder``.
+
+        Raises:
+            DamagedFileError: if they are not what this run has written there.
+        """
+        owner = _identity(self, self.make_problem())
+        path = check_path("folder", folder)
+        return {name: _read_costs(_costs_file(path, name), _token(owner, name)) for name in policies}
 
     def carry_out(
         self,
-        folder: Path,
+        folder: str | PathLike[str],
         *,
         device: torch.device | str = "cpu",
         progress: bool = False,
@@ -90,6 +118,8 @@ class TrainingRun:
         on_labels: OnLabels | None = None,
     ) -> dict[str, Comparison]:
         """Train and evaluate, or go on where an interrupted run with the same numbers stopped.
+
+        The best policy is kept in ``best.pt``; it is the base policy as long as no iteration was accepted.
 
         Args:
             folder: folder of the run; new, empty, or that of the same run.
@@ -104,11 +134,24 @@ class TrainingRun:
             comparisons with greedy by policy, in the order of the evaluations; online rollout on fewer states.
 
         Raises:
-            ValueError: if the folder holds something else, or a number is out of range.
+            TypeError: if something is of the wrong kind.
+            ValueError: if the folder holds something else, or there is no such device.
+            OSError: if the folder cannot be written, or was deleted while the run went on.
         """
+        folder = check_path("folder", folder)
+        check_flag("progress", progress)
+        check_callable("report", report)
+        if on_labels is not None:
+            check_callable("on_labels", on_labels)
         problem = self.make_problem(device)
-        open_run_folder(folder, asdict(self))
-        return _Execution(self, problem, folder, progress, report, on_labels).carry_out()
+        identity = _identity(self, problem)
+        path = open_run_folder(folder, identity)
+        execution = _Execution(self, problem, path, identity, progress, report, on_labels)
+        try:
+            return execution.carry_out()
+        except OSError as error:
+            execution.check_folder(error)
+            raise
 
 
 @dataclass
@@ -116,65 +159,97 @@ class _Execution:
     run: TrainingRun
     problem: Problem
     folder: Path
+    identity: dict[str, Any]
     progress: bool
     report: Report
     on_labels: OnLabels | None
     results: dict[str, Comparison] = field(default_factory=dict)
 
     def carry_out(self) -> dict[str, Comparison]:
-        run, model, config = self.run, self.problem.model, self.run.config
-        bases = {name: make(model) for name, make in BASE_POLICIES.items()}
+        run, bases = self.run, {name: make(self.problem.model) for name, make in BASE_POLICIES.items()}
         for name, policy in bases.items():
             self._compare(name, policy, run.states)
         base = bases[run.base]
-        online: dict[str, Any] = {"trajectories": run.online_trajectories}
-        self._compare(f"R-NT of {run.base}", r_nt(self.problem, base, **online), run.states)
-        logger = CSVLogger("log", log_dir=str(self.folder))
+        self._compare(f"R-NT of {run.base}", r_nt(self.problem, base, trajectories=run.online_trajectories), run.states)
+        best, policy = self._train(base)
+        if run.online_states:
+            online = r_nt(self.problem, policy, trajectories=run.online_trajectories)
+            self._compare(f"{best} + R-NT", online, run.online_states)
+        self.check_folder()
+        return self.results
+
+    def _train(self, base: TensorDictModuleBase) -> tuple[str, TensorDictModuleBase]:
+        """Carry out the iterations, keep and evaluate their policies; name and policy of the best one."""
+        run = self.run
+        best: str = run.base
         training = ALGORITHMS[run.algorithm](
             self.problem,
-            config,
+            run.config,
             base,
             folder=self.folder,
-            logger=logger,
+            logger=CSVLogger("log", log_dir=str(self.folder)),
             progress=self.progress,
             on_labels=self.on_labels,
         )
-        best: str = run.base
+        never = PartitionedValue([NeverRepairCost(self.problem.model)] * partition_of(self.problem).num_parts)
+        untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, base, never)
+        if not (self.folder / "best.pt").is_file():
+            self._keep("best.pt", untrained)
         summaries = []
         for iteration in training:
             name = f"{run.algorithm} {iteration.number}"
-            checkpoint = Checkpoint(self.problem, config, run.algorithm, iteration.number, iteration.policy, iteration.value)
-            save_checkpoint(self.folder / f"iteration-{iteration.number}.pt", checkpoint)
+            checkpoint = Checkpoint(
+                self.problem, run.config, run.algorithm, iteration.number, iteration.policy, iteration.value
+            )
+            self._keep(f"iteration-{iteration.number}.pt", checkpoint)
             if iteration.accepted:
-                save_checkpoint(self.folder / "best.pt", checkpoint)
+                self._keep("best.pt", checkpoint)
                 best = name
-            if iteration.number == 1 and training.plan[-1].truncation is not None:
-                # What the networks of the startgame have learnt from, played online.
-                truncated = r_t(self.problem, base, iteration.value, **online)
-                self._compare(f"R-T of {run.base}", truncated, run.states)
+            if iteration.number == 1:
+                self._compare_truncated(training, base, iteration)
             self._compare(name, iteration.policy, run.states)
             summaries.append(_summary(iteration))
             write_json(self.folder / "iterations.json", summaries)
-        if run.online_states:
-            self._compare(f"{best} + R-NT", r_nt(self.problem, training.best, **online), run.online_states)
-        return self.results
+        if best == run.base:
+            self._keep("best.pt", untrained)
+        return best, training.best
+
+    def _compare_truncated(self, training: PolicyIteration, base: TensorDictModuleBase, iteration: Iteration) -> None:
+        """Evaluate what the networks of the startgame have learnt from, played online, where simulations are cut."""
+        if training.plan[-1].truncation is not None:
+            truncated = r_t(self.problem, base, iteration.value, trajectories=self.run.online_trajectories)
+            self._compare(f"R-T of {self.run.base}", truncated, self.run.states)
+
+    def _keep(self, name: str, checkpoint: Checkpoint) -> None:
+        self.check_folder()
+        save_checkpoint(self.folder / name, checkpoint)
+
+    def check_folder(self, cause: BaseException | None = None) -> None:
+        """Raise if the folder is no longer the one that the run has opened."""
+        if not (self.folder / "config.json").is_file():
+            what = f"run folder {self.folder} was deleted or moved while the run went on"
+            raise FileNotFoundError(f"{what}: delete what is left of it and start the run again") from cause
 
     @cached_property
     def _baseline(self) -> Tensor:
-        return self._costs("greedy", GreedyRepair(self.problem.model), self.run.states)
+        return self._costs("greedy", BASE_POLICIES["greedy"](self.problem.model), self.run.states)
 
     def _compare(self, name: str, policy: Policy, states: int) -> None:
         """Add a policy's comparison with greedy, and bring the folder's metrics up to date."""
         costs = self._costs(name, policy, min(states, self.run.states))
         self.results[name] = compare(costs, self._baseline[: costs.numel()])
+        self.check_folder()
         write_json(self.folder / "metrics.json", {key: asdict(value) for key, value in self.results.items()})
         self.report(name, self.results[name])
 
     def _costs(self, name: str, policy: Policy, states: int) -> Tensor:
         """Costs from the first evaluation states, computed once."""
-        path = _costs_file(self.folder, name)
+        path, token = _costs_file(self.folder, name), _token(self.identity, name)
         if path.is_file():
-            return load_tensors(path)
+            try:
+                return _read_costs(path, token, states)
+            except DamagedFileError as error:
+                torchrl_logger.warning(f"{error}; it is computed again")
         costs = discounted_costs(
             self.problem.model,
             policy,
@@ -185,12 +260,37 @@ class _Execution:
             progress=self.progress,
             name=f"evaluate {name}",
         ).cpu()
-        save_tensors(path, costs)
+        self.check_folder()
+        save_tensors(path, {"token": token, "costs": costs})
         return costs
+
+
+def _identity(run: TrainingRun, problem: Problem) -> dict[str, Any]:
+    """All that decides the results of a run, as JSON."""
+    bases = {name: digest(make(problem.model)) for name, make in BASE_POLICIES.items()}
+    return {**asdict(run), "version": __version__, "problem_digest": problem_digest(problem), "base_policies": bases}
 
 
 def _costs_file(folder: Path, policy: str) -> Path:
     return folder / "costs" / f"{policy}.pt"
+
+
+def _token(identity: dict[str, Any], policy: str) -> str:
+    """Whose costs a file holds."""
+    return digest([identity, policy])
+
+
+def _read_costs(path: Path, token: str, states: int | None = None) -> Tensor:
+    """Costs ``[states]`` that the run and policy of ``token`` have; a ``DamagedFileError`` where they are anything else."""
+    content = load_tensors(path)
+    if not isinstance(content, dict) or content.get("token") != token:
+        raise DamagedFileError(f"{path} does not hold the costs of this policy in this run")
+    costs = content.get("costs")
+    if not isinstance(costs, Tensor) or costs.ndim != 1 or states not in (None, costs.numel()):
+        raise DamagedFileError(f"{path} does not hold the costs from this run's start states")
+    if not costs.is_floating_point() or not bool(torch.isfinite(costs).all()):
+        raise DamagedFileError(f"{path} holds costs that are not finite")
+    return costs
 
 
 def _summary(iteration: Iteration) -> dict[str, Any]:

@@ -1,16 +1,24 @@
-"""The numbers of a policy iteration, checked when they are given."""
+"""The numbers of a policy iteration, checked when they are given; PyTorch is not needed to read them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-__all__ = ["PolicyIterationConfig"]
+from torchrl_pomdp.checks import check_choice, check_flag, check_integer, check_number, check_seed, check_sizes
 
-_POSITIVE = (
-    "iterations", "samples_per_part", "trajectories", "max_steps", "memory_capacity", "value_samples",
-    "batch_size", "epochs", "least_steps", "validation_states",
-)  # fmt: skip
+__all__ = ["EVALUATION_SEED", "PolicyIterationConfig"]
+
+# Start states of evaluations are drawn under this seed, whatever the training's.
+EVALUATION_SEED = 20200
+
+# Counts, from 1, with their largest values: above any use, below what no machine could hold or finish.
+_COUNTS = {
+    "iterations": 1000, "samples_per_part": 10**9, "trajectories": 10**6, "max_steps": 10**6, "memory_capacity": 10**9,
+    "value_samples": 10**9, "batch_size": 10**7, "epochs": 10**6, "least_steps": 10**9, "validation_states": 10**9,
+}  # fmt: skip
+_INTERVALS = {"visited_share": "[0, 1]", "exploration": "[0, 1]", "visits_per_label": "(0, 1000]", "learning_rate": "(0, 1]"}
+_WIDEST, _DEEPEST = 1 << 14, 16
 
 
 @dataclass(frozen=True)
@@ -18,6 +26,7 @@ class PolicyIterationConfig:
     """How approximate policy iteration collects labels and trains (paper, Sections IV to VI).
 
     Raises:
+        TypeError: if something is of the wrong kind; the message names it.
         ValueError: if a number is out of range; the message names it.
 
     Examples:
@@ -25,7 +34,7 @@ class PolicyIterationConfig:
         3
         >>> PolicyIterationConfig(iterations=0)
         Traceback (most recent call last):
-        ValueError: iterations must be at least 1, got 0
+        ValueError: iterations must be an integer in 1..1000, got 0
     """
 
     iterations: int = 3
@@ -96,19 +105,23 @@ class PolicyIterationConfig:
     """Seed of everything that is random: states, labels, initial weights, batches."""
 
     def __post_init__(self) -> None:
-        for name in _POSITIVE:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("visited_share", "exploration"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        for name in ("visits_per_label", "learning_rate"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         for name, hint in get_type_hints(type(self)).items():
-            if get_origin(hint) is Literal and getattr(self, name) not in get_args(hint):
-                raise ValueError(f"{name} must be one of {', '.join(get_args(hint))}, got {getattr(self, name)!r}")
-        for name in ("hidden", "value_hidden"):
-            sizes = getattr(self, name)
-            if not sizes or min(sizes) < 1:
-                raise ValueError(f"{name} must hold positive layer sizes, got {sizes}")
+            object.__setattr__(self, name, _checked(name, getattr(self, name), hint))
+
+
+def _checked(name: str, value: Any, hint: Any) -> Any:
+    """A field's value as it is kept."""
+    if name in _COUNTS:
+        return check_integer(name, value, 1, _COUNTS[name])
+    if name in _INTERVALS:
+        return check_number(name, value, _INTERVALS[name])
+    if get_origin(hint) is Literal:
+        return check_choice(name, value, get_args(hint))
+    if name == "seed":
+        return check_seed(name, value)
+    if name == "symmetries":
+        return check_flag(name, value)
+    sizes = check_sizes(name, value, _WIDEST)
+    if len(sizes) > _DEEPEST:
+        raise ValueError(f"{name} must hold at most {_DEEPEST} sizes, got {len(sizes)}")
+    return sizes

@@ -1,0 +1,227 @@
+"""Cases of the test of refusals: evaluation, reports, files and checks; see the cases of planning."""
+
+from __future__ import annotations
+
+import torch
+from _hostile import (
+    Hostile,
+    choices,
+    devices,
+    dtypes,
+    flags,
+    integers,
+    keys,
+    mappings,
+    no_states,
+    not_callable,
+    numbers,
+    objects,
+    paths,
+    probabilities,
+    seeds,
+    sequences,
+    sizes,
+    tensors,
+    terminal_costs,
+    texts,
+    values,
+)
+from _valid import (
+    CHAIN,
+    COSTS,
+    ITERATIONS,
+    KEYS,
+    a_check,
+    a_policy,
+    a_start,
+    at_once,
+    belief_model,
+    callback,
+    case,
+    comparison,
+    greedy,
+    model,
+    quick_reproduce,
+    repair_model,
+    state,
+    written,
+)
+
+from torchrl_pomdp import checks, evaluation, files, noise, report, reproduce
+from torchrl_pomdp.modules import ZeroCost
+
+__all__ = ["FILES", "REPORTS"]
+
+# fmt: off
+
+RESULTS = [report.Result("greedy", comparison())]
+TITLES = values(None, 3, b"x", [], object())
+RUNS = [*mappings(), *values({"run": None}, {"run": 3}, {"run": [3]}, {"run": [{}]})]
+NO_TENSORS = values(object(), {"x": object()}, len, int)
+
+REPORTS = {
+    "evaluation.discounted_costs": lambda _: case(
+        evaluation.discounted_costs,
+        model=belief_model(),
+        policy=at_once(a_policy()),
+        start=at_once(a_start()),
+        num_states=(2, integers(1)),
+        seed=(0, integers()),
+        max_steps=(3, integers(1)),
+        terminal_cost=at_once((ZeroCost(), terminal_costs())),
+        progress=(False, flags()),
+        name=("evaluate", texts()),
+    ),
+    "evaluation.estimate": lambda _: case(evaluation.estimate, values=(torch.ones(2), tensors(torch.ones(2), free=True))),
+    "evaluation.compare": lambda _: case(
+        evaluation.compare,
+        costs=(torch.ones(2), tensors(torch.ones(2))),
+        baseline=(torch.ones(2), tensors(torch.ones(2))),
+    ),
+    "noise.seed_keys": lambda _: case(
+        noise.seed_keys,
+        seed=(0, integers()),
+        index=(KEYS, keys()),
+    ),
+    "report.Result": lambda _: case(report.Result, name=("greedy", texts()), comparison=(comparison(), objects())),
+    "report.table": lambda _: case(
+        report.table, results=(RESULTS, sequences(RESULTS, None, 3, "x", comparison(), empty=False))
+    ),
+    "report.cost_figure": lambda _: case(
+        report.cost_figure, results=(RESULTS, sequences(RESULTS, None, 3, "x", comparison())), title=("title", TITLES)
+    ),
+    "report.iteration_figure": lambda _: case(
+        report.iteration_figure,
+        lines=({"run": [comparison()]}, [*mappings(), *values({"run": None}, {"run": [3]})]),
+    ),
+    "report.time_figure": lambda _: case(report.time_figure, runs=({"run": ITERATIONS}, RUNS)),
+    "report.effort_table": lambda _: case(report.effort_table, runs=({"run": ITERATIONS}, RUNS)),
+    "report.effort": lambda _: case(
+        report.effort,
+        iterations=(ITERATIONS, sequences(ITERATIONS, None, 3, {}, {"parts": {}}, {"parts": 3}, {"parts": {"a": {}}})),
+    ),
+    "report.trajectory_figure": lambda _: case(
+        report.trajectory_figure,
+        model=repair_model(),
+        trajectory=(greedy()(state()), [
+            *no_states(greedy()(state()), "belief", "location"), *(Hostile("no action", state(), names=("action",)),)
+        ]),
+        title=("title", TITLES),
+    ),
+    "report.interval_text": lambda _: case(report.interval_text, value=(comparison().cost, objects(comparison()))),
+    "report.ratio_texts": lambda _: case(
+        report.ratio_texts, ratio=(comparison().ratio, objects(comparison())), digits=(3, integers(0))
+    ),
+    "report.draw": lambda folder: case(
+        report.draw, figures=({folder / "a.png": lambda: report.cost_figure(RESULTS)}, mappings())
+    ),
+    "report.is_iteration": lambda _: case(report.is_iteration, policy=("API 1", values(None, 3, b"x", [], object()))),
+    "report.paired_ratios": lambda _: case(
+        report.paired_ratios,
+        costs=(
+            {"API 1": torch.ones(2), "API 2": torch.ones(2)},
+            [*mappings(), *values({"API 1": 3, "API 2": 3}, {3: torch.ones(2)})],
+        ),
+    ),
+    "report.paired_table": lambda _: case(
+        report.paired_table,
+        problem=("line3", texts()),
+        ratios=(
+            {"API 1": {"API 2": comparison().ratio}},
+            [*mappings(), *values({"API 1": 3}, {"API 1": {"API 2": 3}})],
+        ),
+    ),
+    "reproduce.Experiment": lambda _: case(
+        reproduce.Experiment,
+        name=("tiny", texts()),
+        problems=(("line3",), sequences(("line3",), "no such", 3, None)),
+        algorithms=(("API",), sequences(("API",), "no such", 3, None)),
+        states=(8, integers(1)),
+    ),
+    "reproduce.settings_config": lambda _: case(
+        reproduce.settings_config,
+        settings=("paper", choices()),
+        problem=("line3", choices()),
+        scale=(1.0, numbers("(0, inf)")),
+        seed=(0, seeds()),
+    ),
+    "reproduce.plan": lambda _: case(reproduce.plan, **an_experiment()),
+    "reproduce.reproduce": lambda folder: case(
+        quick_reproduce,
+        **an_experiment(),
+        runs=(folder / "runs", paths()),
+        out=(folder / "results", paths()),
+        device=("cpu", devices()),
+        report=callback(),
+        tell=callback(),
+        progress=(False, flags()),
+    ),
+}
+
+
+def an_experiment():
+    return {
+        "experiment": (reproduce.EXPERIMENTS["optimum"], objects(reproduce.Experiment)),
+        "settings": ("paper", choices()),
+        "base": ("greedy", choices()),
+        "scale": (1.0, numbers("(0, inf)")),
+        "seed": (0, seeds()),
+        "problems": ((), sequences(("line3",), "no such", 3, None, empty=False)),
+    }
+
+
+FILES = {
+    "files.write_bytes": lambda folder: case(
+        files.write_bytes, path=(folder / "a", paths()), content=(b"x", values(None, 3, "x", [], object()))
+    ),
+    "files.write_json": lambda folder: case(
+        files.write_json,
+        path=(folder / "a", paths()),
+        content=({}, values(object(), {"a": object()}, {1j: 0}, {"a": 1j}, {"a": b"x"})),
+    ),
+    "files.check_folder": lambda folder: case(
+        lambda path: files.check_folder("path", path), path=(folder, [*paths(), Hostile("a file", written(folder / "a.json"))])
+    ),
+    "files.read_json": lambda folder: case(files.read_json, path=(written(folder / "a.json"), paths())),
+    "files.claim": lambda folder: case(
+        files.claim,
+        path=(folder / "a.json", paths()),
+        identity=({"seed": 0}, [*mappings(), *values({"seed": object()}, {1j: 0})]),
+    ),
+    "files.save_tensors": lambda folder: case(
+        files.save_tensors, path=(folder / "a.pt", paths()), content=({"x": KEYS}, NO_TENSORS)
+    ),
+    "files.tensor_bytes": lambda _: case(files.tensor_bytes, content=({"x": KEYS}, NO_TENSORS)),
+    "files.load_tensors": lambda folder: case(
+        files.load_tensors, path=(written(folder / "a.pt"), paths()), device=("cpu", devices())
+    ),
+    "files.parse_tensors": lambda folder: case(
+        files.parse_tensors,
+        content=(files.tensor_bytes({"x": KEYS}), values(None, 3, "x", [], object())),
+        path=(folder / "a.pt", paths()),
+        device=("cpu", devices()),
+    ),
+    "checks.check_integer": lambda _: a_check(checks.check_integer, 3, integers(1, 9), least=1, most=9),
+    "checks.check_seed": lambda _: a_check(checks.check_seed, 3, seeds()),
+    "checks.check_number": lambda _: a_check(checks.check_number, 0.5, numbers("(0, 1)"), interval="(0, 1)"),
+    "checks.check_flag": lambda _: a_check(checks.check_flag, True, flags()),
+    "checks.check_choice": lambda _: a_check(checks.check_choice, "soft", choices(), allowed=("soft", "l2")),
+    "checks.check_text": lambda _: a_check(checks.check_text, "x", texts()),
+    "checks.check_path": lambda _: a_check(checks.check_path, "x", paths()),
+    "checks.check_instance": lambda _: a_check(checks.check_instance, model(), objects(), kind=type(model())),
+    "checks.check_callable": lambda _: a_check(checks.check_callable, len, not_callable()),
+    "checks.check_sizes": lambda _: a_check(checks.check_sizes, (4,), sizes()),
+    "checks.check_device": lambda _: a_check(checks.check_device, "cpu", devices()),
+    "checks.check_dtype": lambda _: a_check(checks.check_dtype, torch.float32, dtypes()),
+    "checks.check_tensor": lambda _: a_check(checks.check_tensor, COSTS, tensors(COSTS), shape=(2,)),
+    "checks.check_keys": lambda _: a_check(checks.check_keys, KEYS, keys()),
+    # Of a real tensor, which is checked before.
+    "checks.check_distributions": lambda _: a_check(
+        checks.check_distributions, CHAIN,
+        [value for value in probabilities(CHAIN) if value.label in ("all zero", "all one", "halved", "negative", "with NaN")],
+    ),
+    "checks.check_sequence": lambda _: a_check(checks.check_sequence, (3,), sequences((3,), "3", None, 1.5), kind=int, least=1),
+    "checks.check_mapping": lambda _: a_check(
+        checks.check_mapping, {"a": 3}, [*mappings(), *values({3: 3}, {"a": "3"}, {"a": None})], kind=int
+    ),
+}

@@ -1,0 +1,131 @@
+"""What the subcommands of ``torchrl-pomdp`` do; every argument is checked before anything is computed or written."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_pomdp.checks import check_choice, check_device, check_integer, check_seed
+from torchrl_pomdp.config import EVALUATION_SEED, PolicyIterationConfig
+from torchrl_pomdp.envs import PRESETS, BeliefEnv, Problem, make_problem
+from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
+from torchrl_pomdp.files import check_folder, write_json
+from torchrl_pomdp.modules import NeverRepairCost, Policy
+from torchrl_pomdp.noise import fold, seed_keys
+from torchrl_pomdp.provenance import provenance
+from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, ratio_texts, table, trajectory_figure
+from torchrl_pomdp.reproduce import EXPERIMENTS
+from torchrl_pomdp.reproduce import reproduce as reproduce_experiment
+from torchrl_pomdp.trainers import load_checkpoint, r_nt
+from torchrl_pomdp.trainers.architecture import BASE_POLICIES
+from torchrl_pomdp.trainers.run import TrainingRun
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from torchrl_pomdp.cli import Evaluate, Reproduce, Train
+
+__all__ = ["evaluate", "reproduce", "train"]
+
+
+def train(command: Train) -> None:
+    """Carry out a training run; print its table, then draw its pictures."""
+    config = PolicyIterationConfig(**asdict(command.config))
+    run = TrainingRun(command.problem, command.algorithm, command.base, config, command.states, command.online_states)
+    device = check_device("device", command.device)
+    default = Path("runs") / f"{command.problem}-{command.algorithm}-{command.base}-seed{config.seed}"
+    out = check_folder("out", command.out or default)
+    problem = run.make_problem(device)
+    print(f"{problem.name}: {problem.model.describe()}\nrun folder: {out}", flush=True)
+    comparisons = run.carry_out(out, device=device, progress=True, report=_tell)
+    results = [Result(name, comparison) for name, comparison in comparisons.items()]
+    print(f"\n{table(results)}\n", flush=True)
+    write_json(out / "provenance.json", provenance())
+    best = load_checkpoint(out / "best.pt", device=device)
+    title = f"{problem.name}, {command.states} start states; below each policy its ratio to greedy"
+    figures = {
+        out / "costs.png": partial(cost_figure, results, title),
+        out / "trajectory.png": partial(_trajectory_figure, problem, best.policy),
+    }
+    print(draw(figures))
+    if best.iteration == 0:
+        print(
+            f"no iteration was accepted: best.pt is the base policy, {best.name}. What usually helps: more --samples-per-part, "
+            "more --validation-states, more --trajectories"
+        )
+
+
+def _tell(name: str, comparison: Comparison) -> None:
+    ratio, interval = ratio_texts(comparison.ratio)
+    of_greedy = f"{ratio} of greedy ({interval})" if comparison.ratio else f"cost {interval_text(comparison.cost)}"
+    print(f"{name}: {of_greedy}", flush=True)
+
+
+def _trajectory_figure(problem: Problem, policy: Policy) -> Figure:
+    """The trajectory of ``policy`` from the first start state of the evaluations."""
+    env = BeliefEnv(problem.model, problem.start, seed=EVALUATION_SEED)
+    first = torch.tensor(0, device=problem.model.device)
+    y = env.reset(problem.start(fold(seed_keys(EVALUATION_SEED, first), 0)), set_state=True)
+    with torch.no_grad():
+        trajectory = env.rollout(200, policy, tensordict=y, auto_reset=False)
+    return trajectory_figure(problem.model, trajectory, f"{problem.name}: one trajectory of the best policy")
+
+
+def evaluate(command: Evaluate) -> None:
+    """Compare a policy with the base policies; print the table."""
+    check_integer("states", command.states, 1, 10**9)
+    check_integer("trajectories", command.trajectories, 1, 10**6)
+    check_seed("seed", command.seed)
+    problem, policy, name = _named_policy(command, check_device("device", command.device))
+    policies: dict[str, Policy] = {base: make(problem.model) for base, make in BASE_POLICIES.items()}
+    if command.online:
+        name, policy = f"{name} + R-NT", r_nt(problem, policy, trajectories=command.trajectories)
+    policies.setdefault(name, policy)
+    costs = {
+        name: discounted_costs(
+            problem.model,
+            policy,
+            problem.start,
+            num_states=command.states,
+            seed=command.seed,
+            terminal_cost=NeverRepairCost(problem.model),
+            progress=True,
+            name=f"evaluate {name}",
+        )
+        for name, policy in policies.items()
+    }
+    print(f"{problem.name}: {problem.model.describe()}; {command.states} start states, seed {command.seed}\n")
+    print(table([Result(name, compare(cost, costs["greedy"])) for name, cost in costs.items()]))
+
+
+def _named_policy(command: Evaluate, device: torch.device) -> tuple[Problem, TensorDictModuleBase, str]:
+    """The problem, the policy and its name that ``evaluate`` was asked for."""
+    check_choice("problem", command.problem, sorted(PRESETS))
+    if command.policy in BASE_POLICIES:
+        problem = make_problem(command.problem, device=device)
+        return problem, BASE_POLICIES[command.policy](problem.model), command.policy
+    checkpoint = load_checkpoint(command.policy, device=device)
+    return checkpoint.problem, checkpoint.policy, checkpoint.name
+
+
+def reproduce(command: Reproduce) -> None:
+    """Carry out an experiment; print its tables, then draw its pictures."""
+    reproduce_experiment(
+        EXPERIMENTS[command.experiment],
+        scale=command.scale,
+        settings=command.settings,
+        base=command.base,
+        problems=command.problems,
+        seed=command.seed,
+        runs=command.runs,
+        out=command.out,
+        device=command.device,
+        report=lambda run, name, comparison: _tell(f"{run}, {name}", comparison),
+        tell=lambda text: print(f"\n{text}", flush=True),
+        progress=True,
+    )

@@ -1,0 +1,197 @@
+"""Legal controls in TorchRL's action spec: what draws random actions draws legal ones.
+
+TorchRL draws random actions from the action spec, in :meth:`EnvBase.rand_action` and in :class:`RandomPolicy`, and looks at no
+state. Which controls are legal depends on the state, so :class:`LegalControls` holds the mask of the current states. All copies
+of the spec share it, because collectors and transforms draw from copies.
+
+A batched environment (``SerialEnv``, ``ParallelEnv``) has the spec of an environment that is gone, and its own environments may
+live in other processes; there is no hook through which they could tell it a mask. Importing this module therefore extends four
+functions of TorchRL: the two that draw show the ``"action_mask"`` of the TensorDict at hand to the spec before they draw, and
+``set_seed`` of the two batched environments seeds the spec. Nothing changes for any other spec.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import wraps
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Categorical, Composite, TensorSpec
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
+from torchrl.modules import RandomPolicy
+
+from torchrl_pomdp.envs.belief import inverse_cdf
+from torchrl_pomdp.noise import fold
+
+__all__ = ["LegalControls"]
+
+
+class _Current:
+    """What the copies of a spec share: the mask of the current states, and where random numbers come from."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        self.generator = generator
+        self.mask: Tensor | None = None
+
+
+class LegalControls(Categorical):
+    """Action spec that draws legal controls of the current states.
+
+    Any control of the model is *in* the spec, as stored actions belong to other states than the current ones.
+
+    Args:
+        n: U, the number of controls.
+        shape: shape of the actions.
+        device: where actions are.
+        dtype: type of actions.
+        mask: legal controls of the current states, see :meth:`update_mask`.
+
+    Keyword Args:
+        generator: source of the random numbers; None makes one that is seeded by the operating system.
+
+    Examples:
+        >>> spec = LegalControls(3)
+        >>> copy = spec.expand(2)
+        >>> spec.update_mask(torch.tensor([[False, True, False], [False, False, True]]))
+        >>> copy.rand()
+        tensor([1, 2])
+    """
+
+    def __init__(
+        self,
+        n: int,
+        shape: torch.Size | None = None,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype = torch.int64,
+        mask: Tensor | None = None,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if generator is None:
+            generator = torch.Generator(device="cpu" if device is None else device)
+            generator.seed()
+        self._current = _Current(generator)
+        super().__init__(n, shape, device, dtype, mask)
+
+    def update_mask(self, mask: Tensor | None) -> None:
+        """Set the legal controls of the current states: bool ``[*B, U]``; None keeps what is known."""
+        # TorchRL's own mask stays unset: it would have to fit the spec's shape, and would refuse stored actions.
+        self.mask = None
+        if mask is not None:
+            self.show(mask)
+
+    def show(self, mask: Tensor, changed: Tensor | None = None) -> None:
+        """Tell all copies the legal controls ``[*B, U]`` of the current states, of those that have ``changed`` ``[*B, 1]``."""
+        known = self._current.mask
+        if changed is not None and known is not None and known.shape == mask.shape:
+            mask = torch.where(changed, mask, known)
+        self._current.mask = mask
+
+    def reseed(self, seed: int | None) -> None:
+        """Seed the random numbers of all copies; None: by the operating system."""
+        if seed is None:
+            self._current.generator.seed()
+        else:
+            # Another stream than that of an environment with the same seed.
+            self._current.generator.manual_seed(int(fold(torch.tensor(seed), 1)) & (2**63 - 1))
+
+    def rand(self, shape: torch.Size | tuple[int, ...] | None = None) -> Tensor:
+        """Random legal controls of the current states; any control if their batch is not that of what is drawn."""
+        size = torch.Size([*(shape or ()), *self.shape])
+        generator, mask = self._current.generator, self._current.mask
+        if mask is None or mask.shape[:-1] not in ((), size):
+            return torch.randint(self.n, size, generator=generator, device=generator.device).to(self.device, self.dtype)
+        noise = torch.rand(size, generator=generator, dtype=torch.float32, device=generator.device)
+        weights = mask.to(generator.device, noise.dtype).expand(*size, self.n)
+        return inverse_cdf(weights, noise).to(self.device, self.dtype)
+
+    # Copies share what is current.
+
+    def _sharing(self, copy: LegalControls) -> LegalControls:
+        copy._current = self._current
+        return copy
+
+    def clone(self) -> LegalControls:
+        """A copy; see :class:`~torchrl.data.Categorical`, also for what follows."""
+        return self._sharing(super().clone())
+
+    def to(self, dest: Any) -> LegalControls:
+        """A copy on a device or of a type."""
+        return self._sharing(super().to(dest))
+
+    def expand(self, *shape: Any) -> LegalControls:
+        """A copy of a larger batch."""
+        return self._sharing(super().expand(*shape))
+
+    def squeeze(self, dim: int | None = None) -> LegalControls:
+        """A copy without a dimension of size one."""
+        return self._sharing(super().squeeze(dim))
+
+    def unsqueeze(self, dim: int) -> LegalControls:
+        """A copy with one more dimension of size one."""
+        return self._sharing(super().unsqueeze(dim))
+
+    def unbind(self, dim: int = 0) -> tuple[LegalControls, ...]:
+        """A copy for each index of a dimension."""
+        return tuple(self._sharing(copy) for copy in super().unbind(dim))
+
+    def __getitem__(self, idx: Any) -> LegalControls:
+        return self._sharing(super().__getitem__(idx))
+
+    def _reshape(self, shape: Any) -> LegalControls:
+        return self._sharing(super()._reshape(shape))
+
+    def _unflatten(self, dim: int, sizes: Any) -> LegalControls:
+        return self._sharing(super()._unflatten(dim, sizes))
+
+
+def _legal(spec: TensorSpec | None) -> Iterator[LegalControls]:
+    """The specs of legal controls in an action spec."""
+    for leaf in spec.values(True, True) if isinstance(spec, Composite) else (spec,):
+        if isinstance(leaf, LegalControls):
+            yield leaf
+
+
+def _looking(draw: Callable[..., Any], spec: Callable[[Any], TensorSpec | None]) -> Callable[..., Any]:
+    """The method ``draw(self, tensordict)``, which first shows the mask of the TensorDict to the specs that it draws from."""
+
+    @wraps(draw)
+    def look_and_draw(self: Any, tensordict: TensorDictBase | None = None) -> Any:
+        mask = None if tensordict is None else tensordict.get("action_mask", None)
+        if mask is not None:
+            for leaf in _legal(spec(self)):
+                leaf.show(mask)
+        return draw(self, tensordict)
+
+    return look_and_draw
+
+
+def _seeding(set_seed: Callable[..., Any]) -> Callable[..., Any]:
+    """The method ``set_seed(self, seed, static_seed)`` of a batched environment, which also seeds its action spec."""
+
+    @wraps(set_seed)
+    def seed_all(self: Any, seed: int | None = None, static_seed: bool = False) -> Any:
+        for leaf in _legal(self.full_action_spec):
+            leaf.reseed(seed)
+        return set_seed(self, seed, static_seed)
+
+    return seed_all
+
+
+def _extend(owner: type, name: str, extend: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
+    """Replace a method once, whoever imports this module how often."""
+    method = getattr(owner, name)
+    if getattr(method, "_knows_legal_controls", False):
+        return
+    extended = extend(method)
+    extended._knows_legal_controls = True  # type: ignore[attr-defined]
+    setattr(owner, name, extended)
+
+
+_extend(EnvBase, "rand_action", lambda draw: _looking(draw, lambda env: env.input_spec["full_action_spec"]))
+_extend(RandomPolicy, "__call__", lambda draw: _looking(draw, lambda policy: policy.action_spec))
+_extend(SerialEnv, "set_seed", _seeding)
+_extend(ParallelEnv, "set_seed", _seeding)

@@ -1,0 +1,23 @@
+"""Tables and pictures of results."""
+
+from torchrl_pomdp.report.effort import Effort, effort, effort_table
+from torchrl_pomdp.report.figures import cost_figure, draw, iteration_figure, time_figure, trajectory_figure
+from torchrl_pomdp.report.tables import Result, interval_text, is_iteration, paired_ratios, paired_table, ratio_texts, table
+
+__all__ = [
+    "Effort",
+    "Result",
+    "cost_figure",
+    "draw",
+    "effort",
+    "effort_table",
+    "interval_text",
+    "is_iteration",
+    "iteration_figure",
+    "paired_ratios",
+    "paired_table",
+    "ratio_texts",
+    "table",
+    "time_figure",
+    "trajectory_figure",
+]

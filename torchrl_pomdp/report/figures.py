@@ -1,0 +1,182 @@
+"""Pictures of results; matplotlib, the extra ``plot``, is imported when one is drawn."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_pomdp.checks import check_callable, check_instance, check_mapping, check_sequence
+from torchrl_pomdp.envs.repair import REPAIR, RepairModel
+from torchrl_pomdp.evaluation import Comparison, Estimate
+from torchrl_pomdp.files import write_bytes
+from torchrl_pomdp.report.effort import check_iterations, effort
+from torchrl_pomdp.report.tables import Result, half_width, ratio_texts
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["cost_figure", "draw", "iteration_figure", "time_figure", "trajectory_figure"]
+
+
+def draw(figures: Mapping[Path, Callable[[], Figure]]) -> str:
+    """Draw figures and write them to files.
+
+    Args:
+        figures: what makes the figure of each file.
+
+    Returns:
+        a line that says where they are, or why there are none: results are not lost for want of a picture.
+
+    Raises:
+        TypeError: if something is of the wrong kind.
+    """
+    for path, make in check_instance("figures", figures, Mapping).items():
+        check_instance("key of figures", path, Path)
+        check_callable(f"figures[{str(path)!r}]", make)
+    try:
+        for path, make in figures.items():
+            content = io.BytesIO()
+            make().savefig(content, format="png")
+            write_bytes(path, content.getvalue())
+    except Exception as error:  # whatever the drawing, its fonts or the disk may raise
+        return f"no pictures: {' '.join(str(error).split()) or type(error).__name__}"
+    return f"pictures: {', '.join(map(str, figures))}"
+
+
+def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
+    """Bars of discounted cost with 95 % intervals.
+
+    Raises:
+        TypeError: if something is of the wrong kind.
+        ValueError: if there is nothing to draw.
+        ImportError: if matplotlib, the extra ``plot``, is not installed.
+    """
+    check_sequence("results", results, Result, least=1)
+    check_instance("title", title, str)
+    figure = _new_figure(1.4 * len(results) + 1.6, 3.6)
+    axes = figure.add_subplot()
+    means = [result.comparison.cost.mean for result in results]
+    names = [f"{result.name}\n{ratio_texts(result.comparison.ratio)[0]}" for result in results]
+    errors = [half_width(result.comparison.cost) for result in results]
+    axes.bar(names, means, yerr=errors, capsize=5, color=["#9aa5b1"] + ["#3572a5"] * (len(results) - 1))
+    axes.set_ylabel("discounted cost")
+    axes.set_title(title)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def iteration_figure(lines: Mapping[str, Sequence[Comparison]]) -> Figure:
+    """Ratio to greedy against iteration, one line for each run; iteration 0 is the base policy.
+
+    Args:
+        lines: comparisons of base policy, first iteration, second iteration, ... by run.
+
+    Raises:
+        TypeError: if something is of the wrong kind.
+        ImportError: if matplotlib, the extra ``plot``, is not installed.
+    """
+    for name, comparisons in check_mapping("lines", lines, Sequence).items():
+        check_sequence(f"lines[{name!r}]", comparisons, Comparison)
+    figure = _new_figure(6.0, 3.8)
+    axes = figure.add_subplot()
+    for number, (name, comparisons) in enumerate(lines.items()):
+        # Where a ratio means nothing there is a gap.
+        ratios = [comparison.ratio or Estimate(math.nan, math.nan, 0) for comparison in comparisons]
+        # A little apart, so that intervals do not hide each other.
+        x = [i + 0.04 * number for i in range(len(ratios))]
+        axes.errorbar(x, [r.mean for r in ratios], yerr=[half_width(r) for r in ratios], capsize=4, marker="o", label=name)
+    axes.set(xlabel="iteration", ylabel="cost, ratio to greedy")
+    axes.locator_params(axis="x", integer=True)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    return figure
+
+
+def time_figure(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """Time of labelling and training by part, stacked; beside it what it would be with one processor for each part.
+
+    Args:
+        runs: iterations of every run, as a run's ``iterations.json`` has them.
+
+    Raises:
+        TypeError: if something is of the wrong kind.
+        ValueError: if they are not what ``iterations.json`` has.
+        ImportError: if matplotlib, the extra ``plot``, is not installed.
+    """
+    for name, iterations in check_mapping("runs", runs, Sequence).items():
+        check_iterations(f"runs[{name!r}]", iterations)
+    figure = _new_figure(2.2 * len(runs) + 3.0, 4.0)
+    axes = figure.add_subplot()
+    ticks, labels = [], []
+    for number, (name, iterations) in enumerate(runs.items()):
+        bottom = 0.0
+        for iteration in iterations:
+            for record in iteration["parts"].values():
+                for kind, colour in (("label_seconds", "#3572a5"), ("train_seconds", "#e8a33d")):
+                    axes.bar(number, record[kind], 0.36, bottom=bottom, color=colour, edgecolor="white", linewidth=0.4)
+                    bottom += record[kind]
+        axes.bar(number + 0.4, effort(iterations).parallel_seconds, 0.36, color="#9aa5b1")
+        ticks.append(number + 0.2)
+        labels.append(name)
+    for colour, label in (("#3572a5", "labelling"), ("#e8a33d", "training"), ("#9aa5b1", "one processor for each part")):
+        axes.bar(0, 0, color=colour, label=label)
+    axes.set_xticks(ticks, labels, fontsize="small")
+    axes.set_ylabel("seconds")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside upper center", ncols=3, fontsize="small")
+    return figure
+
+
+def trajectory_figure(model: RepairModel, trajectory: TensorDictBase, title: str = "") -> Figure:
+    """One trajectory: locations by time, colour the expected damage, robots' paths over it, repairs marked.
+
+    Args:
+        model: the repair model.
+        trajectory: ``[T]`` with ``belief``, ``location`` and ``action``, as ``BeliefEnv.rollout`` gives it.
+        title: title of the figure.
+
+    Raises:
+        TypeError: if something is of the wrong kind.
+        ValueError: if an entry is missing.
+        ImportError: if matplotlib, the extra ``plot``, is not installed.
+    """
+    check_instance("model", model, RepairModel)
+    check_instance("title", title, str)
+    missing = [
+        key for key in ("belief", "location", "action") if key not in check_instance("trajectory", trajectory, TensorDictBase)
+    ]
+    if missing:
+        raise ValueError(f"trajectory must have the entry {missing[0]!r}, got {sorted(map(str, trajectory.keys()))}")
+    steps = trajectory.batch_size[0]
+    damage = trajectory["belief"] @ torch.arange(model.num_levels, dtype=model.dtype, device=model.device)
+    figure = _new_figure(max(5.0, 0.14 * steps + 2.5), max(2.5, 0.16 * model.num_locations + 1.2))
+    axes = figure.add_subplot()
+    image = axes.imshow(
+        damage.T.cpu().numpy(), aspect="auto", cmap="YlOrRd", vmin=0, vmax=model.num_levels - 1, interpolation="nearest"
+    )
+    figure.colorbar(image, ax=axes, label="expected damage level")
+    controls = model.split_controls(trajectory["action"])
+    for robot in range(model.num_robots):
+        path = trajectory["location"][:, robot].cpu().numpy()
+        axes.plot(range(steps), path, color="#1f4e79", linewidth=1.2, label=f"robot {robot + 1}")
+        repairs = (controls[:, robot] == REPAIR).nonzero().squeeze(-1).cpu().numpy()
+        axes.scatter(repairs, path[repairs], marker="P", s=44, color="#1f4e79", edgecolor="white", linewidth=0.6)
+    axes.scatter([], [], marker="P", color="#1f4e79", label="repair")
+    axes.legend(loc="upper right", fontsize="small")
+    axes.set(xlabel="stage", ylabel="location", title=title)
+    axes.locator_params(integer=True)
+    return figure
+
+
+def _new_figure(width: float, height: float) -> Figure:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError("pictures need matplotlib: pip install 'torchrl-pomdp[plot]'") from error
+    return Figure(figsize=(width, height), layout="constrained", dpi=120)
