@@ -183,7 +183,7 @@ TRAINERS = {
         terminal_cost=(ZeroCost(), [wrong for wrong in terminal_costs() if wrong.refused == "at once"]),
     ),
     "trainers.make_networks": lambda _: an_architecture(trainers.make_networks),
-    "trainers.make_values": lambda _: an_architecture(trainers.make_values),
+    "trainers.make_values": lambda _: an_architecture(trainers.make_values, scale=(None, objects(ZeroCost))),
     "trainers.train_part": lambda _: case(
         trainers.train_part,
         batch=(labelled(), [*values(None, 3, "x", {}, [], object()), Hostile("no states", labelled()[:0])]),
@@ -250,5 +250,5 @@ def an_algorithm(algorithm, *, partitioned=True):
     return case(algorithm, problem=a_problem(partitioned=partitioned), config=a_config(), base_policy=a_module())
 
 
-def an_architecture(make):
-    return case(make, problem=a_problem(), config=a_config(), seed=(0, seeds()), encoder=(None, objects(FlatEncoder)))
+def an_architecture(make, **more):
+    return case(make, problem=a_problem(), config=a_config(), seed=(0, seeds()), encoder=(None, objects(FlatEncoder)), **more)

@@ -51,7 +51,7 @@ class Case(NamedTuple):
 
     def hostile(self) -> Iterator[tuple[str, Hostile]]:
         """Arguments and what they must not be; None is skipped where the signature allows it."""
-        known = inspect.signature(self.call).parameters
+        known = _parameters(self.call)
         for name, (_, wrong) in self.arguments.items():
             allowed = name in known and (known[name].default is None or "None" in str(known[name].annotation))
             yield from ((name, value) for value in wrong if not (allowed and value.value is None))
@@ -60,6 +60,14 @@ class Case(NamedTuple):
         """The valid arguments but for those that are changed; no call sees what another one has written."""
         arguments = {name: valid for name, (valid, _) in self.arguments.items()} | changed
         return {name: value.copy() if isinstance(value, TensorDictBase) else value for name, value in arguments.items()}
+
+
+def _parameters(call: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """Parameters of a callable; of a class with those of its bases, which it may pass on."""
+    makers = (
+        [call] if not isinstance(call, type) else [vars(c)["__init__"] for c in call.__mro__[::-1] if "__init__" in vars(c)]
+    )
+    return {name: p for make in makers for name, p in inspect.signature(make).parameters.items()}
 
 
 def case(call: Callable[..., Any], use: Callable[[Any], Any] = lambda made: None, /, **arguments: Argument) -> Case:
@@ -214,7 +222,7 @@ def a_start() -> Argument:
 
 def at_once(argument: Argument) -> Argument:
     """An argument that the call itself uses."""
-    return argument[0], [wrong._replace(refused="at once") for wrong in argument[1]]
+    return argument[0], [w._replace(refused="at once") if w.refused == "in use" else w for w in argument[1]]
 
 
 def a_config() -> Argument:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
-from torchrl_pomdp.envs import BeliefEnv, make_problem
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief, TabularModel, make_problem
 from torchrl_pomdp.evaluation import discounted_costs
 from torchrl_pomdp.modules import GreedyRepair, PartitionedPolicy, PolicyNetwork, RelativeEncoder, RolloutPolicy
 from torchrl_pomdp.objectives import ClassificationLoss
@@ -39,3 +41,40 @@ def test_collecting_and_training_stay_on_the_device():
     loss = ClassificationLoss(policy)(batch)["loss_policy"]
     loss.backward()
     assert torch.isfinite(loss)
+
+
+def test_environments_draw_legal_controls_there():
+    problem = make_problem("linear20", device="cuda")
+    for batch in ((), (5,)):
+        env = BeliefEnv(problem.model, problem.start, batch_size=batch, seed=0)
+        check_env_specs(env)
+        data = env.rollout(30, break_when_any_done=False)
+        assert data["action"].is_cuda
+        assert data["action_mask"].gather(-1, data["action"].unsqueeze(-1)).all()
+    assert problem.model.to("cuda") is problem.model
+    assert env.to("cuda") is env
+    with pytest.raises(ValueError, match="build the model on cpu"):
+        problem.model.to("cpu")
+
+
+def test_generators_may_give_states_of_the_cpu():
+    half = torch.full((1, 2, 2), 0.5)
+    model = TabularModel(half, half, torch.zeros(2, 1), 0.9, device="cuda")
+    assert BeliefEnv(model, FixedBelief(torch.tensor([0.3, 0.7])), batch_size=(2,)).reset()["belief"].is_cuda
+
+
+def test_tabular_models_agree_with_the_cpu():
+    generator = torch.Generator().manual_seed(0)
+    transition, observation = torch.rand(4, 33, 33, generator=generator), torch.rand(4, 33, 7, generator=generator)
+    tables = transition / transition.sum(-1, keepdim=True), observation / observation.sum(-1, keepdim=True)
+    cost = torch.rand(33, 4, generator=generator)
+    belief = torch.rand(500, 33, generator=generator)
+    u = torch.arange(500) % 4
+    probs = []
+    for device in ("cpu", "cuda"):
+        model = TabularModel(*tables, cost, 0.9, device=device)
+        y = model.drawn(
+            lambda keys: TensorDict({"belief": belief / belief.sum(-1, keepdim=True)}, keys.shape), torch.arange(500)
+        )
+        probs.append(model.observation_probs(y, u.to(device)).cpu())
+    torch.testing.assert_close(*probs)

@@ -80,22 +80,16 @@ def check_integer(name: str, value: Any, least: int | None = None, most: int | N
         3
         >>> check_integer("states", 0, 1)
         Traceback (most recent call last):
-        ValueError: states must be an integer of at least 1, got 0
+        ValueError: states must be at least 1, got 0
     """
     if isinstance(value, bool) or not isinstance(value, Integral):
-        raise TypeError(f"{name} must be {_integers(least, most)}, got {shown(value)}")
+        raise TypeError(f"{name} must be an integer, got {shown(value)}")
     number = int(value)
-    if (least is not None and number < least) or (most is not None and number > most):
-        raise ValueError(f"{name} must be {_integers(least, most)}, got {shown(value)}")
+    if least is not None and number < least:
+        raise ValueError(f"{name} must be at least {least}, got {shown(value)}")
+    if most is not None and number > most:
+        raise ValueError(f"{name} must be at most {most}, got {shown(value)}")
     return number
-
-
-def _integers(least: int | None, most: int | None) -> str:
-    if least is None and most is None:
-        return "an integer"
-    if most is None:
-        return f"an integer of at least {least}"
-    return f"an integer of at most {most}" if least is None else f"an integer in {least}..{most}"
 
 
 def check_seed(name: str, value: Any) -> int:
@@ -129,7 +123,7 @@ def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
         0.9
         >>> check_number("discount", 1, "(0, 1)")
         Traceback (most recent call last):
-        ValueError: discount must be a number in (0, 1), got 1
+        ValueError: discount must be in (0, 1), got 1
     """
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number in {interval}, got {shown(value)}")
@@ -140,8 +134,10 @@ def check_number(name: str, value: Any, interval: str = "(-inf, inf)") -> float:
         number = math.inf
     above = low < number or (interval[0] == "[" and number == low)
     below = number < high or (interval[-1] == "]" and number == high)
+    if interval == "[0, inf)" and number < 0:
+        raise ValueError(f"{name} must not be negative, got {shown(value)}")
     if not (above and below and math.isfinite(number)):
-        raise ValueError(f"{name} must be a number in {interval}, got {shown(value)}")
+        raise ValueError(f"{name} must be in {interval}, got {shown(value)}")
     return number
 
 

@@ -34,7 +34,7 @@ class PolicyIterationConfig:
         3
         >>> PolicyIterationConfig(iterations=0)
         Traceback (most recent call last):
-        ValueError: iterations must be an integer in 1..1000, got 0
+        ValueError: iterations must be at least 1, got 0
     """
 
     iterations: int = 3

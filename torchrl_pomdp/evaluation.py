@@ -112,7 +112,7 @@ def discounted_costs(
     keys = seed_keys(seed, torch.arange(num_states, device=model.device))
     with progress_bar(None, "step", check_text("name", name), check_flag("progress", progress)) as bar:
         cost = TruncatedRollout(model, _Watched(policy, bar), max_steps=max_steps, terminal_cost=terminal_cost)
-        return cost(model.drawn(start, fold(keys, 0)), fold(keys, 1))
+        return cost(model.drawn(start, fold(keys, 0), "start"), fold(keys, 1))
 
 
 class _Watched:

@@ -98,13 +98,13 @@ def test_parts_that_nobody_visits_are_filled_with_random_states(linear20):
 
 def test_bad_arguments_are_refused(linear20):
     memory, greedy = StateMemory(linear20.model), GreedyRepair(linear20.model)
-    with pytest.raises(ValueError, match="capacity must be an integer of at least 1, got 0"):
+    with pytest.raises(ValueError, match="capacity must be at least 1, got 0"):
         StateMemory(linear20.model, capacity=0)
-    with pytest.raises(ValueError, match=r"retain must be a number in \(0, 1\], got 0"):
+    with pytest.raises(ValueError, match=r"retain must be in \(0, 1\], got 0"):
         StateMemory(linear20.model, retain=0)
-    with pytest.raises(ValueError, match="exploration must be a number in"):
+    with pytest.raises(ValueError, match="exploration must be in"):
         memory.visit(greedy, linear20.start, torch.arange(2), exploration=1.5)
-    with pytest.raises(ValueError, match="max_steps must be an integer in 1"):
+    with pytest.raises(ValueError, match="max_steps must be at least 1"):
         memory.visit(greedy, linear20.start, torch.arange(2), max_steps=0)
-    with pytest.raises(ValueError, match="visited_share must be a number in"):
+    with pytest.raises(ValueError, match="visited_share must be in"):
         training_states(linear20, memory, 2, visited_share=2.0)

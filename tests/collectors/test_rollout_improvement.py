@@ -121,7 +121,7 @@ def test_tabular_models_are_labelled_by_the_same_collector():
 
 
 def test_other_environments_are_refused():
-    with pytest.raises(TypeError, match="create_env_fn must be a BeliefEnv or a function that makes one, got PendulumEnv"):
+    with pytest.raises(TypeError, match="must give a BeliefEnv, got PendulumEnv"):
         RolloutImprovement(PendulumEnv(), make_policy(), states=make_states(), frames_per_batch=4)
     with pytest.raises(ValueError, match="num_workers"):
         collector(num_workers=0)

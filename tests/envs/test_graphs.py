@@ -34,7 +34,7 @@ def test_bad_graphs_are_refused():
         Graph.from_edges("broken", 4, [(0, 1), (2, 3)])
     with pytest.raises(ValueError, match="allowed are pairs"):
         Graph.from_edges("broken", 2, [(0, 2)])
-    with pytest.raises(ValueError, match=r"num_locations must be an integer in 1\.\.1024, got 0"):
+    with pytest.raises(ValueError, match="num_locations must be at least 1, got 0"):
         line(0)
     with pytest.raises(ValueError, match="height"):
         grid(2, 0)

@@ -123,9 +123,9 @@ def random_tiger(left):
 
 def test_bad_arguments_are_refused(line3):
     rollout = RolloutPolicy(line3.model, GreedyRepair(line3.model))
-    with pytest.raises(ValueError, match=r"depth must be an integer in 1\.\.3, got 4"):
+    with pytest.raises(ValueError, match="depth must be 1, 2 or 3, got 4"):
         MultistepLookahead(rollout, 4)
-    with pytest.raises(ValueError, match=r"branches must be an integer in 1\.\.256, got 0"):
+    with pytest.raises(ValueError, match="branches must be at least 1, got 0"):
         MultistepLookahead(rollout, 2, branches=0)
-    with pytest.raises(ValueError, match="margin must be a number in"):
+    with pytest.raises(ValueError, match="margin must not be negative"):
         MultistepLookahead(rollout, 2, margin=-0.1)

@@ -167,7 +167,7 @@ def test_labels_are_added_to_the_states_and_can_be_trained_on(linear20):
 
 def test_bad_arguments_are_refused(linear20):
     model, greedy, y = linear20.model, GreedyRepair(linear20.model), linear20.start(torch.arange(4))
-    with pytest.raises(ValueError, match=r"trajectories must be an integer in 1\.\.16777216, got 0"):
+    with pytest.raises(ValueError, match="trajectories must be at least 1, got 0"):
         PolicyCost(model, greedy, trajectories=0)
     with pytest.raises(ValueError, match="truncation needs a terminal_cost"):
         PolicyCost(model, greedy, truncation=AfterSteps(3))

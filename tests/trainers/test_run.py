@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchrl_pomdp import kept as kept_results
 from torchrl_pomdp.files import load_tensors, save_tensors
 from torchrl_pomdp.modules import UrgencyRepair
 from torchrl_pomdp.trainers import PolicyIterationConfig, load_checkpoint, parts, policy_iteration
@@ -76,7 +77,7 @@ def foreign(tmp_path_factory):
 
 def results(folder):
     """What must not change: policies and costs, to the last bit."""
-    costs = {path.name: load_tensors(path)["costs"].tolist() for path in folder.glob("costs/*.pt")}
+    costs = {path.name: load_tensors(path)["content"]["costs"].tolist() for path in folder.glob("costs/*.pt")}
     return costs, {path.name: path.read_bytes() for path in folder.glob("*.pt")}
 
 
@@ -137,7 +138,7 @@ def resume(folder, name, expected):
 def test_damaged_files_never_give_another_result(whole, labelled, foreign, tmp_path, monkeypatch, kind):
     """Every file of a run: those that say whose it is one by one, all others, which are computed again, at once."""
     warnings = []
-    monkeypatch.setattr(module.torchrl_logger, "warning", lambda text, *args: warnings.append(text))
+    monkeypatch.setattr(kept_results.logger, "warning", lambda text, *args: warnings.append(text))
     folder, found = whole
     expected = found, results(folder)
     names = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
@@ -155,7 +156,7 @@ def test_damaged_files_never_give_another_result(whole, labelled, foreign, tmp_p
     costs = [warning for warning in warnings if "costs" in warning]
     # A flipped bit may be one that says nothing.
     assert len(costs) == 5 or kind == "flipped", "one line for each file of costs"
-    assert all("computed again" in warning for warning in costs)
+    assert all("made again" in warning for warning in costs)
 
 
 def test_costs_of_fewer_states_are_computed_again(whole, tmp_path):
@@ -163,11 +164,11 @@ def test_costs_of_fewer_states_are_computed_again(whole, tmp_path):
     shutil.copytree(whole[0], folder)
     path = folder / "costs" / "urgency.pt"
     content = load_tensors(path)
-    save_tensors(path, content | {"costs": content["costs"][:7]})
+    save_tensors(path, content | {"content": {"costs": content["content"]["costs"][:7]}})
     with pytest.raises(ValueError, match="does not hold the costs"):
         replace(RUN, states=9).costs(folder, ["urgency"])
     assert RUN.carry_out(folder) == whole[1]
-    assert torch.equal(RUN.costs(folder, ["urgency"])["urgency"], content["costs"])
+    assert torch.equal(RUN.costs(folder, ["urgency"])["urgency"], content["content"]["costs"])
 
 
 def test_equal_runs_have_equal_files(whole, tmp_path):

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.collectors import Collector
 from tqdm import tqdm
 
-from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_path, check_text, shown
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_path, check_text
 from torchrl_pomdp.collectors.states import StateSampler
 from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.identity import digest
@@ -106,7 +106,9 @@ class LabelCollector(Collector):
         kwargs["trust_policy"] = True
         env = _environment(create_env_fn)
         if policy is not None:
-            first = env.model.with_features(env.model.drawn(self.states, torch.zeros(1, dtype=torch.int64, device=env.device)))
+            first = env.model.derive(
+                env.model.drawn(self.states, torch.zeros(1, dtype=torch.int64, device=env.device), "states")
+            )
             env.model.check_controls(first, controls_of("policy", policy, first.copy()))
         super().__init__(
             env,
@@ -154,7 +156,7 @@ class LabelCollector(Collector):
         """Labelled states with the given numbers ``[N]``, and what they took."""
         before, begin = self.labeller.simulated_steps, time.perf_counter()
         model = self.env.model
-        block = self.labeller(model.with_features(model.drawn(self.states, numbers)))
+        block = self.labeller(model.derive(model.drawn(self.states, numbers, "states")))
         steps, seconds = self.labeller.simulated_steps - before, time.perf_counter() - begin
         return {"states": block.to_dict(), "simulated_steps": steps, "seconds": seconds}
 
@@ -174,5 +176,5 @@ def _environment(create_env_fn: Any) -> BeliefEnv:
     makes = callable(create_env_fn) and not isinstance(create_env_fn, (nn.Module, type))
     env = create_env_fn() if makes else create_env_fn
     if not isinstance(env, BeliefEnv):
-        raise TypeError(f"create_env_fn must be a BeliefEnv or a function that makes one, got {shown(env)}")
+        raise TypeError(f"create_env_fn must be or must give a BeliefEnv, got {type(env).__name__}")
     return env

@@ -129,7 +129,7 @@ class StateMemory:
     ) -> Iterator[TensorDictBase]:
         """The retained states of every step of the trajectories with the given keys."""
         model = self.model
-        y = model.with_features(model.drawn(start, fold(keys, _START)))
+        y = model.derive(model.drawn(start, fold(keys, _START), "start"))
         scenarios = Scenarios.single(fold(keys, _STEPS))
         for step in range(max_steps):
             rest = (~model.is_terminal(y)).nonzero().squeeze(-1)

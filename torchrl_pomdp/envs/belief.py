@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec
 
-from torchrl_pomdp.checks import check_callable, check_instance, check_keys, check_number, shown
+from torchrl_pomdp.checks import check_callable, check_instance, check_keys, check_number, check_sequence, shown
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.noise import fingerprint
 
@@ -211,7 +211,18 @@ class BeliefModel(nn.Module, ABC):
 
         Returns:
             a new TensorDict ``[*B]``; the entries of ``y`` are shared, not copied.
+
+        Raises:
+            TypeError: if ``keys`` are no names; by :meth:`check_state`.
+            ValueError: by :meth:`check_state`.
         """
+        if keys is not None:
+            check_sequence("keys", keys, str)
+        self.check_state(y)
+        return self.derive(y, keys)
+
+    def derive(self, y: TensorDictBase, keys: tuple[str, ...] | None = None) -> TensorDictBase:
+        """:meth:`with_features` of states that the model has made or has checked."""
         result = TensorDict({key: y.get(key) for key in self.state_keys}, batch_size=y.batch_size, device=self.device)
         if keys is None or "action_mask" in keys:
             result.set("action_mask", self.action_mask(result))
@@ -309,8 +320,8 @@ class BeliefModel(nn.Module, ABC):
             where = tuple((~possible).nonzero()[0].tolist())
             raise ValueError(f"observation {int(z[where])} at batch index {where} is impossible after this control")
 
-    def drawn(self, generator: StateGenerator, keys: Tensor) -> TensorDictBase:
-        """The feature states ``[*B]`` that a generator gives for int64 keys ``[*B]``, checked.
+    def drawn(self, generator: StateGenerator, keys: Tensor, name: str = "generator") -> TensorDictBase:
+        """The feature states ``[*B]`` that a generator, called ``name`` in messages, gives for int64 keys ``[*B]``, checked.
 
         Core entries come to the model's device and, where they are floating, to its type.
 
@@ -323,7 +334,7 @@ class BeliefModel(nn.Module, ABC):
             >>> tiger().drawn(FixedBelief(torch.tensor([0.5, 0.5])), torch.arange(3))["belief"].shape
             torch.Size([3, 2])
         """
-        y = generated(generator, keys)
+        y = generated(generator, keys, name)
         result = TensorDict(dict(y.items()), batch_size=y.batch_size, device=self.device)
         for key in self.state_keys:
             leaf = result.get(key, None)
@@ -340,14 +351,14 @@ class BeliefModel(nn.Module, ABC):
         )
 
 
-def generated(generator: StateGenerator, keys: Tensor) -> TensorDictBase:
+def generated(generator: StateGenerator, keys: Tensor, name: str = "generator") -> TensorDictBase:
     """What a generator gives for int64 keys ``[*B]``: raises unless it is a TensorDict ``[*B]``."""
-    check_callable("generator", generator)
+    check_callable(name, generator)
     y = generator(check_keys("keys", keys))
     if not isinstance(y, TensorDictBase):
-        raise TypeError(f"generator must give a TensorDict of feature states, got {shown(y)}")
+        raise TypeError(f"{name} must give a TensorDict of feature states, got {shown(y)}")
     if y.batch_size != keys.shape:
-        raise ValueError(f"generator must give one state for each key, {tuple(keys.shape)}, got batch {tuple(y.batch_size)}")
+        raise ValueError(f"{name} must give one state for each key, {tuple(keys.shape)}, got batch {tuple(y.batch_size)}")
     return y
 
 

@@ -112,11 +112,10 @@ class BeliefEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         shape = self.batch_size if tensordict is None else tensordict.batch_size
         if set_state and tensordict is not None:
-            self.model.check_state(tensordict)
             y = self.model.with_features(tensordict)
         else:
             keys = torch.randint(-(2**62), 2**62, tuple(shape), generator=self.rng, device=self.device)
-            y = self.model.with_features(self.model.drawn(self.generator, keys))
+            y = self.model.derive(self.model.drawn(self.generator, keys))
         flags = None if tensordict is None else tensordict.get("_reset", None)
         self._controls.show(y.get("action_mask"), flags)
         return self._with_done(y)

@@ -190,7 +190,7 @@ class InPart:
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` of the part for int64 keys ``[*B]``; terminal states are rejected too."""
         flat = check_keys("keys", keys).reshape(-1)
-        result = self.model.drawn(self.proposal, flat)
+        result = self.model.drawn(self.proposal, flat, "proposal")
         missing = (~self._accepted(result)).nonzero().squeeze(-1)
         tried = 1
         while missing.numel() and tried < self.max_tries:

@@ -257,7 +257,7 @@ def _distances(table: Tensor) -> Tensor:
             steps += 1
         if -1 in distance:
             unreachable = distance.index(-1)
-            raise ValueError(f"location {unreachable} is unreachable from location {origin}: the graph must be connected")
+            raise ValueError(f"location {unreachable} is unreachable from location {origin}: edges must connect all locations")
         result.append(distance)
     return torch.tensor(result, dtype=torch.int64)
 

@@ -32,9 +32,16 @@ __all__ = ["LegalControls"]
 class _Current:
     """What the copies of a spec share: the mask of the current states, and where random numbers come from."""
 
-    def __init__(self, generator: torch.Generator) -> None:
+    def __init__(self, generator: torch.Generator | None) -> None:
         self.generator = generator
         self.mask: Tensor | None = None
+
+    def source(self, device: torch.device) -> torch.Generator:
+        """Where random numbers come from; if nobody gave a generator, from a new one, seeded by the operating system."""
+        if self.generator is None:
+            self.generator = torch.Generator(device)
+            self.generator.seed()
+        return self.generator
 
 
 class LegalControls(Categorical):
@@ -70,9 +77,6 @@ class LegalControls(Categorical):
         *,
         generator: torch.Generator | None = None,
     ) -> None:
-        if generator is None:
-            generator = torch.Generator(device="cpu" if device is None else device)
-            generator.seed()
         self._current = _Current(generator)
         super().__init__(n, shape, device, dtype, mask)
 
@@ -92,16 +96,17 @@ class LegalControls(Categorical):
 
     def reseed(self, seed: int | None) -> None:
         """Seed the random numbers of all copies; None: by the operating system."""
+        generator = self._current.source(self.device)
         if seed is None:
-            self._current.generator.seed()
+            generator.seed()
         else:
             # Another stream than that of an environment with the same seed.
-            self._current.generator.manual_seed(int(fold(torch.tensor(seed), 1)) & (2**63 - 1))
+            generator.manual_seed(int(fold(torch.tensor(seed), 1)) & (2**63 - 1))
 
     def rand(self, shape: torch.Size | tuple[int, ...] | None = None) -> Tensor:
         """Random legal controls of the current states; any control if their batch is not that of what is drawn."""
         size = torch.Size([*(shape or ()), *self.shape])
-        generator, mask = self._current.generator, self._current.mask
+        generator, mask = self._current.source(self.device), self._current.mask
         if mask is None or mask.shape[:-1] not in ((), size):
             return torch.randint(self.n, size, generator=generator, device=generator.device).to(self.device, self.dtype)
         noise = torch.rand(size, generator=generator, dtype=torch.float32, device=generator.device)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torchrl_pomdp.checks import check_device, check_instance, check_integer, check_number, check_tensor, check_text, shown
 from torchrl_pomdp.envs.graphs import Graph
 from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["Partition", "RepairPartition", "SinglePart"]
 
@@ -78,6 +79,7 @@ class SinglePart(Partition):
 
     def forward(self, y: TensorDictBase) -> Tensor:
         """Zeros, int64 ``[*B]``."""
+        check_entries("y", y, ())
         return torch.zeros(y.batch_size, dtype=torch.int64, device=y.device)
 
 
@@ -148,6 +150,7 @@ class RepairPartition(Partition):
 
     def forward(self, y: TensorDictBase) -> Tensor:
         """Part index int64 ``[*B]``: three times the phase (0 startgame, 1 endgame) plus the density class."""
+        check_entries("y", y, ("belief", "location"))
         belief, location = y.get("belief"), y.get("location")
         # A view [L, K, *B]: the model keeps the batch innermost.
         planes = belief.movedim((-2, -1), (0, 1))

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.graphs import Graph
 from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["Symmetry", "symmetries"]
 
@@ -48,7 +49,7 @@ class Symmetry:
         Args:
             y: ``belief`` and ``location``, and any of ``action_mask``, ``partition``, ``action`` and ``q_factors``.
         """
-        image, keys = y.copy(), set(y.keys())
+        image, keys = check_entries("y", y, ("belief", "location")).copy(), set(y.keys())
         back = self.locations.argsort()
         image.set("belief", y.get("belief").index_select(-2, back))
         image.set("location", self.locations[y.get("location").index_select(-1, self.robots)])

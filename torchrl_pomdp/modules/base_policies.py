@@ -84,11 +84,11 @@ class UrgencyRepair(TensorDictModuleBase):
 
     Args:
         model: the repair model.
-        exponent: how much the distance counts, in [0, 100].
+        exponent: how much the distance counts, not negative.
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if ``exponent`` is out of range.
+        ValueError: if ``exponent`` is negative.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -106,7 +106,7 @@ class UrgencyRepair(TensorDictModuleBase):
     def __init__(self, model: RepairModel, exponent: float = 3.0) -> None:
         super().__init__()
         self.model = check_instance("model", model, RepairModel)
-        self.exponent = check_number("exponent", exponent, "[0, 100]")
+        self.exponent = check_number("exponent", exponent, "[0, inf)")
         self._prices = tuple(model.costs.tolist())
         # [L, L], target by origin.
         nearness = (model.graph.distances.T + 1.0) ** -self.exponent

@@ -133,7 +133,7 @@ class RolloutPolicy(TensorDictModuleBase):
         shape = (*y.batch_size, self.model.num_controls)
         if y.batch_size.numel() == 0:
             return torch.zeros(shape, dtype=self.model.dtype, device=self.model.device)
-        flat = self.model.with_features(y, ("action_mask",)).reshape(-1)
+        flat = self.model.derive(y, ("action_mask",)).reshape(-1)
         leaves = self.model.num_controls * (self.model.num_observations if self.leaves == "observation" else 1)
         trajectories = leaves * max(self._rounds())
         size, threads = blocks(flat.shape[0], trajectories, self.cost_to_go.chunk_rows, self.model.device)

@@ -39,7 +39,7 @@ class MultistepLookahead(TensorDictModuleBase):
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if ``depth`` is not 1, 2 or 3, ``branches`` is not in 1 to 256, or ``margin`` not in [0, 1000].
+        ValueError: if ``depth`` is not 1, 2 or 3, ``branches`` is not in 1 to 256, or ``margin`` is negative.
 
     Examples:
         >>> from torchrl_pomdp.envs import make_problem
@@ -55,9 +55,11 @@ class MultistepLookahead(TensorDictModuleBase):
     def __init__(self, policy: RolloutPolicy, depth: int = 2, branches: int = 5, margin: float | None = None) -> None:
         super().__init__()
         self.policy = check_instance("policy", policy, RolloutPolicy)
-        self.depth = check_integer("depth", depth, 1, 3)
+        if check_integer("depth", depth) not in (1, 2, 3):
+            raise ValueError(f"depth must be 1, 2 or 3, got {depth}")
+        self.depth = depth
         self.branches = check_integer("branches", branches, 1, _BLOCK)
-        self.margin = None if margin is None else check_number("margin", margin, "[0, 1000]")
+        self.margin = None if margin is None else check_number("margin", margin, "[0, inf)")
         self.model, self.in_keys = policy.model, policy.in_keys
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -105,7 +107,7 @@ class MultistepLookahead(TensorDictModuleBase):
             return self.model.action_mask(y)
         q = self.policy.q_factors(y, keys)
         best = q.amin(-1, keepdim=True)
-        return q <= best + self.margin * best.abs()
+        return torch.isfinite(q) & (q <= best + self.margin * best.abs())
 
     def _observations(self, probs: Tensor, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Pairs, observations and weights of the branches of P pairs with distributions ``probs`` ``[P, Z]``."""

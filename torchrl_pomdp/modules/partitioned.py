@@ -47,12 +47,11 @@ class _Partitioned(TensorDictModuleBase):
         """Write the entries that all local modules write, for feature states ``[*B]``."""
         members = list(getattr(self, self._name))
         check_instance("tensordict", tensordict, TensorDictBase)
-        part = tensordict.get("partition", None)
-        if part is None:
+        if tensordict.get("partition", None) is None:
             raise ValueError("tensordict lacks the entry 'partition': add it by model.with_features(y)")
-        check_entries("tensordict", tensordict, self.in_keys)
-        part = part.reshape(-1)
-        if part.numel() and not 0 <= int(part.min()) <= int(part.max()) < len(members):
+        part = check_entries("tensordict", tensordict, self.in_keys).get("partition").reshape(-1)
+        known = part.dtype == torch.int64 and (part.numel() == 0 or 0 <= int(part.min()) <= int(part.max()) < len(members))
+        if not known:
             raise ValueError(f"partition must hold parts 0..{len(members) - 1}, got {part.unique().tolist()}")
         flat = tensordict.select(*self.in_keys).reshape(-1)
         result = self._route(flat, part, members)

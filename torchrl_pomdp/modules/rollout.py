@@ -264,10 +264,10 @@ class TruncatedRollout(nn.Module):
     def _admit(self, y: TensorDictBase, scenarios: Scenarios, first: int, last: int, total: Tensor) -> _Live:
         """The trajectories number ``first`` to ``last``, at their start."""
         number = torch.arange(first, min(last, total.numel()), device=total.device)
-        start = self.model.with_features(y[first:last].clone(), self._keys)
+        start = self.model.derive(y[first:last].clone(), self._keys)
         age, memory = torch.zeros_like(number), number.new_zeros(number.numel(), 0)
         if self.truncation is not None:
-            memory = self.truncation.start(self.model.with_features(start))
+            memory = self.truncation.start(self.model.derive(start))
         ended = torch.zeros_like(number, dtype=torch.bool)
         return self._end(_Live(start, scenarios.rows(number), number, age, ended, memory), total)
 
@@ -299,7 +299,7 @@ class TruncatedRollout(nn.Module):
     def _add_terminal_costs(self, terminal_cost: TerminalCost, live: _Live, index: Tensor, total: Tensor) -> None:
         """The terminal cost of the rows ``index`` of ``live``, with features that are made for it here alone."""
         if index.numel():
-            y = self.model.with_features(take_rows(live.y, index), _read_by(terminal_cost))
+            y = self.model.derive(take_rows(live.y, index), _read_by(terminal_cost))
             cost = terminal_costs(terminal_cost, y) * self._discounts[live.age[index]]
             total.index_add_(0, live.number[index], cost)
 

@@ -188,7 +188,7 @@ class PolicyCost(TensorDictModuleBase):
         self.model.check_state(y)
         if y.batch_size.numel() == 0:
             return torch.zeros(y.batch_size, dtype=self.model.dtype, device=self.model.device)
-        flat = self.model.with_features(y, self.model.state_keys).reshape(-1)
+        flat = self.model.derive(y, self.model.state_keys).reshape(-1)
         size, threads = blocks(flat.shape[0], self.trajectories, self.rollout.chunk_rows, self.model.device)
         return torch.cat(map_threads(self._costs, flat.split(size), threads)).view(y.batch_size)
 

@@ -124,9 +124,9 @@ class OnEntering(Truncation):
     def __init__(self, parts: Iterable[int]) -> None:
         if isinstance(parts, str) or not isinstance(parts, Iterable):
             raise TypeError(f"parts must be numbers of parts, got {shown(parts)}")
-        self.parts = tuple(sorted({check_integer("parts", part, 0) for part in parts}))
-        if not self.parts:
-            raise ValueError("parts must hold at least one part, got none")
+        self.parts = tuple(sorted({check_integer("parts", part) for part in parts}))
+        if not self.parts or self.parts[0] < 0:
+            raise ValueError(f"parts must hold at least one part and none below 0, got {self.parts}")
 
     def stop(self, y: TensorDictBase, age: Tensor, memory: Tensor) -> Tensor:
         """Where the state is in one of the parts."""

@@ -84,12 +84,13 @@ class ClassificationLoss(LabelLoss):
         """Loss and metrics of labelled states ``[*B]``; see the class."""
         batch = check_batch(tensordict, self.in_keys)
         label = label_of(batch, self.tensor_keys.action, 1, floating=False)
-        gaps = _gaps(label_of(batch, self.tensor_keys.q_factors, 2, floating=True), label)
+        q_factors = label_of(batch, self.tensor_keys.q_factors, 2, floating=True)
         with self.policy_params.to_module(self.policy, preserve_module_state=False):
             output = self.policy(batch.select(*self.policy.in_keys))
         logits = output.get("logits")
-        if logits.shape != gaps.shape:
-            raise ValueError(f"q_factors must have the logits' shape {tuple(logits.shape)}, got {tuple(gaps.shape)}")
+        if logits.shape != q_factors.shape:
+            raise ValueError(f"q_factors must have the logits' shape {tuple(logits.shape)}, got {tuple(q_factors.shape)}")
+        gaps = _gaps(q_factors, label)
         chosen = logits.detach().argmax(-1)
         return TensorDict(
             {
@@ -104,7 +105,7 @@ def _gaps(q_factors: Tensor, label: Tensor) -> Tensor:
     """Q-factors ``[N, U]`` minus their smallest, zero where illegal; the labels ``[N]`` must be legal."""
     illegal = q_factors == torch.inf
     gaps = (q_factors - q_factors.amin(-1, keepdim=True)).masked_fill(illegal, 0.0)
-    if not bool(torch.isfinite(gaps).all()):
+    if not bool(torch.isfinite(gaps).all()) or bool(illegal.all(-1).any()):
         raise ValueError("q_factors must be finite, or +inf where a control is illegal, and not overflow; got others")
     if not bool(((label >= 0) & (label < q_factors.shape[-1])).all()) or bool(illegal.gather(-1, label.unsqueeze(-1)).any()):
         raise ValueError("action must be a legal control, one with a finite Q-factor, got another")

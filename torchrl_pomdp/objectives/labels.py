@@ -68,5 +68,7 @@ def check_loss(name: str, loss: Tensor) -> Tensor:
         ValueError: if it is not finite.
     """
     if not bool(torch.isfinite(loss)):
-        raise ValueError(f"{name} must be finite, got {float(loss)}: a label, or an output of the network, is no number")
+        raise ValueError(
+            f"{name} must be finite, got {float(loss.detach())}: a label, or an output of the network, is no number"
+        )
     return loss

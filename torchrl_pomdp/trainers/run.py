@@ -12,7 +12,6 @@ from typing import Any, Literal
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl import logger as torchrl_logger
 from torchrl.record import CSVLogger
 
 from torchrl_pomdp import __version__
@@ -29,8 +28,9 @@ from torchrl_pomdp.collectors import OnLabels
 from torchrl_pomdp.config import EVALUATION_SEED, PolicyIterationConfig
 from torchrl_pomdp.envs import PRESETS, Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.files import DamagedFileError, load_tensors, save_tensors, write_json
+from torchrl_pomdp.files import DamagedFileError, write_json
 from torchrl_pomdp.identity import digest
+from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import NeverRepairCost, PartitionedValue, Policy
 from torchrl_pomdp.trainers.architecture import BASE_POLICIES, partition_of
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
@@ -104,9 +104,15 @@ class TrainingRun:
         Raises:
             DamagedFileError: if they are not what this run has written there.
         """
-        owner = _identity(self, self.make_problem())
-        path = check_path("folder", folder)
-        return {name: _read_costs(_costs_file(path, name), _token(owner, name)) for name in policies}
+        path, identity = check_path("folder", folder), _identity(self, self.make_problem())
+        found = {}
+        for name in policies:
+            file = _costs_file(path, name)
+            content = kept(file, _owner(identity, name))
+            if content is None:
+                raise DamagedFileError(f"{file} does not hold the costs of this run: carry it out again")
+            found[name] = content["costs"]
+        return found
 
     def carry_out(
         self,
@@ -244,12 +250,10 @@ class _Execution:
 
     def _costs(self, name: str, policy: Policy, states: int) -> Tensor:
         """Costs from the first evaluation states, computed once."""
-        path, token = _costs_file(self.folder, name), _token(self.identity, name)
-        if path.is_file():
-            try:
-                return _read_costs(path, token, states)
-            except DamagedFileError as error:
-                torchrl_logger.warning(f"{error}; it is computed again")
+        path, owner = _costs_file(self.folder, name), _owner(self.identity, name)
+        content = kept(path, owner)
+        if content is not None:
+            return content["costs"]
         costs = discounted_costs(
             self.problem.model,
             policy,
@@ -261,7 +265,7 @@ class _Execution:
             name=f"evaluate {name}",
         ).cpu()
         self.check_folder()
-        save_tensors(path, {"token": token, "costs": costs})
+        keep(path, owner, {"costs": costs})
         return costs
 
 
@@ -275,22 +279,9 @@ def _costs_file(folder: Path, policy: str) -> Path:
     return folder / "costs" / f"{policy}.pt"
 
 
-def _token(identity: dict[str, Any], policy: str) -> str:
-    """Whose costs a file holds."""
+def _owner(identity: dict[str, Any], policy: str) -> str:
+    """Whose costs a file holds: those of a policy in a run."""
     return digest([identity, policy])
-
-
-def _read_costs(path: Path, token: str, states: int | None = None) -> Tensor:
-    """Costs ``[states]`` that the run and policy of ``token`` have; a ``DamagedFileError`` where they are anything else."""
-    content = load_tensors(path)
-    if not isinstance(content, dict) or content.get("token") != token:
-        raise DamagedFileError(f"{path} does not hold the costs of this policy in this run")
-    costs = content.get("costs")
-    if not isinstance(costs, Tensor) or costs.ndim != 1 or states not in (None, costs.numel()):
-        raise DamagedFileError(f"{path} does not hold the costs from this run's start states")
-    if not costs.is_floating_point() or not bool(torch.isfinite(costs).all()):
-        raise DamagedFileError(f"{path} holds costs that are not finite")
-    return costs
 
 
 def _summary(iteration: Iteration) -> dict[str, Any]:
