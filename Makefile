@@ -8,8 +8,9 @@ DEMO ?= runs/demo-$(shell date +%Y%m%d-%H%M%S)
 demo: .venv/installed
 	$(BIN)/torchrl-pomdp train linear20 --samples-per-part 6000 --iterations 2 --out $(DEMO)
 
+# Each worker computes with one thread, as many workers as there are processors.
 test: .venv/installed lint
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist worksteal
 
 lint: .venv/installed
 	$(BIN)/ruff check .

@@ -47,7 +47,7 @@ from _valid import (
     written,
 )
 
-from torchrl_pomdp import checks, evaluation, files, noise, report, reproduce
+from torchrl_pomdp import checks, evaluation, files, noise, report, reproduce, tensor_checks
 from torchrl_pomdp.modules import ZeroCost
 
 __all__ = ["FILES", "REPORTS"]
@@ -211,14 +211,21 @@ FILES = {
     "checks.check_instance": lambda _: a_check(checks.check_instance, model(), objects(), kind=type(model())),
     "checks.check_callable": lambda _: a_check(checks.check_callable, len, not_callable()),
     "checks.check_sizes": lambda _: a_check(checks.check_sizes, (4,), sizes()),
-    "checks.check_device": lambda _: a_check(checks.check_device, "cpu", devices()),
-    "checks.check_dtype": lambda _: a_check(checks.check_dtype, torch.float32, dtypes()),
-    "checks.check_tensor": lambda _: a_check(checks.check_tensor, COSTS, tensors(COSTS), shape=(2,)),
-    "checks.check_keys": lambda _: a_check(checks.check_keys, KEYS, keys()),
+    "tensor_checks.check_device": lambda _: a_check(tensor_checks.check_device, "cpu", devices()),
+    "tensor_checks.check_dtype": lambda _: a_check(tensor_checks.check_dtype, torch.float32, dtypes()),
+    "tensor_checks.check_tensor": lambda _: a_check(tensor_checks.check_tensor, COSTS, tensors(COSTS), shape=(2,)),
+    "tensor_checks.check_keys": lambda _: a_check(tensor_checks.check_keys, KEYS, keys()),
     # Of a real tensor, which is checked before.
-    "checks.check_distributions": lambda _: a_check(
-        checks.check_distributions, CHAIN,
+    "tensor_checks.check_distributions": lambda _: a_check(
+        tensor_checks.check_distributions, CHAIN,
         [value for value in probabilities(CHAIN) if value.label in ("all zero", "all one", "halved", "negative", "with NaN")],
+    ),
+    "tensor_checks.check_entries": lambda _: a_check(
+        tensor_checks.check_entries, state(), [
+            *values(None, 3, "x", [], {}, object()),
+            *(Hostile(f"no {key}", state().exclude(key), names=(key,)) for key in ("belief", "location")),
+        ],
+        keys=("belief", "location"),
     ),
     "checks.check_sequence": lambda _: a_check(checks.check_sequence, (3,), sequences((3,), "3", None, 1.5), kind=int, least=1),
     "checks.check_mapping": lambda _: a_check(

@@ -26,7 +26,7 @@ CASES: dict[str, Callable[[Path], Case]] = {**ENVS, **MODULES, **COLLECTORS, **T
 
 PUBLIC = (
     *("envs", "modules", "collectors", "objectives", "trainers", "trainers.run"),
-    *("evaluation", "noise", "report", "reproduce", "files", "checks", "identity"),
+    *("evaluation", "noise", "report", "reproduce", "files", "checks", "tensor_checks", "identity"),
 )
 
 # What is not tried, and why.

@@ -11,34 +11,22 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
+from typing import Any
 
 __all__ = [
     "check_callable",
     "check_choice",
-    "check_device",
-    "check_distributions",
-    "check_dtype",
     "check_flag",
     "check_instance",
     "check_integer",
-    "check_keys",
     "check_mapping",
     "check_number",
     "check_path",
     "check_seed",
     "check_sequence",
     "check_sizes",
-    "check_tensor",
     "check_text",
 ]
-
-# How far the sum of probabilities may be from one: rounding in long products of float32 numbers.
-SUM_TOLERANCE = 1e-4
 
 
 def shown(value: Any) -> str:
@@ -309,145 +297,3 @@ def check_sizes(name: str, value: Any, most: int = 1 << 20) -> tuple[int, ...]:
     if not value:
         raise ValueError(f"{name} must hold at least one positive integer, got {shown(value)}")
     return tuple(check_integer(f"{name}[{i}]", size, 1, most) for i, size in enumerate(value))
-
-
-def check_device(name: str, value: Any) -> torch.device:
-    """A device that is there, from its name or itself.
-
-    Raises:
-        TypeError: if it is neither.
-        ValueError: if there is no such device here.
-
-    Examples:
-        >>> check_device("device", "cpu")
-        device(type='cpu')
-    """
-    import torch
-
-    if not isinstance(value, (str, torch.device)):
-        raise TypeError(f"{name} must be a device such as cpu or cuda:0, got {shown(value)}")
-    try:
-        device = torch.device(value)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise ValueError(f"{name} must be a device of this machine such as cpu or cuda:0, got {shown(str(value))}") from error
-    return device
-
-
-def check_dtype(name: str, value: Any) -> torch.dtype:
-    """The type of beliefs and costs: float32 or float64.
-
-    Raises:
-        TypeError: if it is no type of tensors.
-        ValueError: if it is another one.
-
-    Examples:
-        >>> import torch
-        >>> check_dtype("dtype", torch.float64)
-        torch.float64
-    """
-    import torch
-
-    if not isinstance(value, torch.dtype):
-        raise TypeError(f"{name} must be torch.float32 or torch.float64, got {shown(value)}")
-    if value not in (torch.float32, torch.float64):
-        raise ValueError(f"{name} must be torch.float32 or torch.float64, got {value}")
-    return value
-
-
-def check_tensor(
-    name: str,
-    value: Any,
-    shape: Sequence[int | None] | None = None,
-    dtype: torch.dtype | None = None,
-    *,
-    finite: bool = True,
-) -> Tensor:
-    """A tensor of a shape.
-
-    Args:
-        name: name of the argument.
-        value: what was given: a tensor, or nested sequences of numbers.
-        shape: its sizes, None for any; None altogether for any shape.
-        dtype: its type; None for any real one.
-
-    Keyword Args:
-        finite: whether all numbers must be finite.
-
-    Raises:
-        TypeError: if it is no such thing.
-        ValueError: if the shape is another or a number is not finite.
-
-    Examples:
-        >>> check_tensor("costs", (0, 1, 5), (3,)).tolist()
-        [0, 1, 5]
-    """
-    import torch
-
-    if not isinstance(value, torch.Tensor):
-        try:
-            # In Python's own precision; a float32 copy of 0.1 is another number.
-            read = torch.as_tensor(value)
-            exact = isinstance(value, Sequence) and read.is_floating_point()
-            value = torch.as_tensor(value, dtype=torch.float64) if exact else read
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-            raise TypeError(f"{name} must be a tensor of numbers, got {shown(value)}") from error
-    if (dtype is not None and value.dtype != dtype) or value.is_complex() or value.is_quantized:
-        raise TypeError(f"{name} must be a tensor of {dtype or 'real numbers'}, got {value.dtype}")
-    if shape is not None and (
-        len(shape) != value.ndim or any(s not in (None, n) for s, n in zip(shape, value.shape, strict=True))
-    ):
-        expected = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name} must have shape ({expected}), got {tuple(value.shape)}")
-    if finite and not bool(torch.isfinite(value).all()):
-        raise ValueError(f"{name} must hold finite numbers, got {value[~torch.isfinite(value)][0].item()} among them")
-    return value
-
-
-def check_keys(name: str, value: Any) -> Tensor:
-    """Keys of random streams: an int64 tensor of any shape.
-
-    Raises:
-        TypeError: if it is anything else.
-
-    Examples:
-        >>> import torch
-        >>> check_keys("keys", torch.arange(2)).tolist()
-        [0, 1]
-    """
-    import torch
-
-    if not isinstance(value, torch.Tensor) or value.dtype != torch.int64:
-        given = value.dtype if isinstance(value, torch.Tensor) else shown(value)
-        raise TypeError(f"{name} must be an int64 tensor, got {given}")
-    return value
-
-
-def check_distributions(name: str, value: Tensor) -> Tensor:
-    """Probabilities ``[*, n]`` whose last dimension sums to one, with rounding allowed for.
-
-    Raises:
-        ValueError: if a number is negative, above one or not finite, or a sum is not one.
-
-    Examples:
-        >>> import torch
-        >>> check_distributions("belief", torch.tensor([0.5, 0.6]))
-        Traceback (most recent call last):
-        ValueError: belief must hold probabilities that sum to 1, got a sum of 1.1
-    """
-    import torch
-
-    if not value.numel():
-        return value
-    rounding = 8 * torch.finfo(value.dtype).eps
-    if not (value.amin() >= -rounding and value.amax() <= 1.0 + rounding):
-        wrong = value[~((value >= -rounding) & (value <= 1.0 + rounding))][0].item()
-        raise ValueError(f"{name} must hold probabilities in [0, 1], got {wrong:.6g} among them")
-    # Along the memory: beliefs often have their first dimension innermost.
-    sums = value.movedim(0, -1).sum(-2) if value.ndim > 1 and value.stride(0) == 1 else value.sum(-1)
-    wrong_sum = (sums - 1.0).abs() > SUM_TOLERANCE
-    if bool(wrong_sum.any()):
-        raise ValueError(
-            f"{name} must hold probabilities that sum to 1, got a sum of {float(sums[wrong_sum].flatten()[0]):.6g}"
-        )
-    return value

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_pomdp.checks import check_choice, check_device, check_integer, check_seed
+from torchrl_pomdp.checks import check_choice, check_integer, check_seed
 from torchrl_pomdp.config import EVALUATION_SEED, PolicyIterationConfig
 from torchrl_pomdp.envs import PRESETS, BeliefEnv, Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
@@ -21,6 +21,7 @@ from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, ratio_texts, table, trajectory_figure
 from torchrl_pomdp.reproduce import EXPERIMENTS
 from torchrl_pomdp.reproduce import reproduce as reproduce_experiment
+from torchrl_pomdp.tensor_checks import check_device
 from torchrl_pomdp.trainers import load_checkpoint, r_nt
 from torchrl_pomdp.trainers.architecture import BASE_POLICIES
 from torchrl_pomdp.trainers.run import TrainingRun

@@ -9,11 +9,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_tensor, check_text
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_text
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.progress import progress_bar
+from torchrl_pomdp.tensor_checks import check_tensor
 
 __all__ = ["Comparison", "Estimate", "compare", "discounted_costs", "estimate"]
 

@@ -13,7 +13,8 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchrl_pomdp.checks import check_device, check_instance, check_path, shown
+from torchrl_pomdp.checks import check_instance, check_path, shown
+from torchrl_pomdp.tensor_checks import check_device
 
 if TYPE_CHECKING:
     import torch

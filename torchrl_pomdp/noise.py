@@ -11,7 +11,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_integer, check_keys
+from torchrl_pomdp.checks import check_integer
+from torchrl_pomdp.tensor_checks import check_keys
 
 __all__ = ["fingerprint", "fold", "permuted", "seed_keys", "uniform"]
 

@@ -17,7 +17,6 @@ from tqdm import tqdm
 from torchrl_pomdp.checks import (
     check_callable,
     check_choice,
-    check_device,
     check_flag,
     check_instance,
     check_integer,
@@ -44,6 +43,7 @@ from torchrl_pomdp.report import (
     ratio_texts,
     time_figure,
 )
+from torchrl_pomdp.tensor_checks import check_device
 from torchrl_pomdp.trainers.run import ALGORITHMS, TrainingRun
 
 if TYPE_CHECKING:

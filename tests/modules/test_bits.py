@@ -29,7 +29,7 @@ from torchrl_pomdp.modules import (
     ZeroCost,
 )
 
-COUNT = 120
+COUNT = 90
 
 
 def model_of(graph, robots, dtype):
@@ -56,7 +56,8 @@ def values(function, y):
 def ways(draw):
     """How the states are computed: order, sizes of the pieces, layout, threads, gradients."""
     order = draw(st.permutations(range(COUNT)))
-    sizes = draw(st.lists(st.integers(1, 50), min_size=3, max_size=8))
+    # A single row is always among them; few pieces, since each costs a call.
+    sizes = [1, *draw(st.lists(st.integers(7, 70), min_size=1, max_size=4))]
     return order, sizes, draw(st.booleans()), draw(st.integers(1, 3)), draw(st.booleans())
 
 
@@ -89,7 +90,7 @@ def networks():
 
 
 @pytest.mark.parametrize(("graph", "robots", "dtype", "encoder", "hidden"), networks())
-@settings(max_examples=4, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=2, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(way=ways())
 def test_outputs_of_networks(graph, robots, dtype, encoder, hidden, way):
     model = model_of(graph, robots, dtype)
@@ -101,7 +102,7 @@ def test_outputs_of_networks(graph, robots, dtype, encoder, hidden, way):
         assert torch.equal(another_way(function, y, way), values(function, y).detach())
 
 
-@settings(max_examples=3, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=2, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(way=ways())
 def test_networks_of_the_papers_size(linear20, way):
     y = linear20.model.with_features(linear20.start(torch.arange(COUNT)))
@@ -131,21 +132,22 @@ def labellers(model):
     }
 
 
+# Labels take longer: in pieces of odd sizes, shuffled, with the batch innermost, in two threads, with gradients.
+SHUFFLED = torch.randperm(COUNT, generator=torch.Generator().manual_seed(0)).tolist()
+A_WAY = SHUFFLED, [37, 1, 18], True, 2, True
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@settings(max_examples=2, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
-@given(way=ways())
-def test_labels_of_repair_problems(dtype, way):
+def test_labels_of_repair_problems(dtype):
     model = model_of(line(7), 1, dtype)
     y = random_states(model, COUNT, 1)
     for name, label in labellers(model).items():
-        assert torch.equal(another_way(label, y, way), values(label, y)), name
+        assert torch.equal(another_way(label, y, A_WAY), values(label, y)), name
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("states", [2, 33, 64])
-@settings(max_examples=2, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
-@given(way=ways())
-def test_labels_of_tabular_problems(states, dtype, way):
+def test_labels_of_tabular_problems(states, dtype):
     generator = torch.Generator().manual_seed(states)
     moves, sees = (torch.rand(3, states, n, generator=generator) for n in (states, 4))
     cost = torch.rand(states, 3, generator=generator)
@@ -159,4 +161,4 @@ def test_labels_of_tabular_problems(states, dtype, way):
         RolloutPolicy(model, network, trajectories=4, leaves="observation", allocation="adaptive", **cut).q_factors,
         PolicyCost(model, network, trajectories=2, **cut).costs,
     ):
-        assert torch.equal(another_way(label, y, way), values(label, y))
+        assert torch.equal(another_way(label, y, A_WAY), values(label, y))

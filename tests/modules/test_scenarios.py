@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+import statistics
+
+import pytest
 import torch
 
-from torchrl_pomdp.envs import make_problem
-from torchrl_pomdp.modules import GreedyRepair, PolicyCost, RolloutPolicy
+from torchrl_pomdp.envs import RepairModel, UniformStart, damage_chain, line, make_problem
+from torchrl_pomdp.modules import GreedyRepair, NeverRepairCost, PolicyCost, RolloutPolicy
 from torchrl_pomdp.modules.scenarios import Scenarios
-from torchrl_pomdp.noise import fold
+from torchrl_pomdp.noise import fold, permuted
 
 
 def group(states, count, seed=0):
@@ -92,3 +96,95 @@ def test_two_robots_have_independent_noise():
     y = problem.start(torch.arange(5))
     cost = PolicyCost(problem.model, GreedyRepair(problem.model), trajectories=3)
     assert torch.equal(torch.cat([cost.costs(row) for row in y.split(1)]), cost.costs(y))
+
+
+def spread_over_seeds(count):
+    """Mean and standard deviation, over 24 seeds, of the cost of greedy at one state by ``count`` trajectories."""
+    model = RepairModel(line(3), damage_chain((0.0, 0.3)), (0.0, 1.0, 10.0), 0.9, terminal_probability=0.0, dtype=torch.float64)
+    y, never = UniformStart(model, (1,))(torch.tensor([0])), NeverRepairCost(model)
+    options = {"trajectories": count, "max_steps": 4, "terminal_cost": never}
+    costs = [float(PolicyCost(model, GreedyRepair(model), seed=seed, **options).costs(y)) for seed in range(24)]
+    return statistics.mean(costs), statistics.stdev(costs)
+
+
+def test_estimates_converge_on_an_instance_that_is_not_additive():
+    """The cost depends on two first observations together; independent trajectories spread by 33.9 / sqrt(n)."""
+    counts = (10, 100, 1000, 10_000)
+    means, spreads = zip(*map(spread_over_seeds, counts), strict=True)
+    assert spreads[0] < 10.7
+    for count, mean, spread in zip(counts, means, spreads, strict=True):
+        # The spread itself is known to about 15 %.
+        assert spread < 1.5 * 33.9 / count**0.5
+        assert spread < 1.5 * spreads[0] * (10 / count) ** 0.5
+        assert abs(mean - 52.2) < 4 * spread / 24**0.5 + 0.05
+
+
+def permutations(keys, count):
+    """Places of all members under every key, ``[K, count]``."""
+    members = torch.arange(count)
+    return permuted(keys.unsqueeze(-1).expand(-1, count).reshape(-1), members.repeat(len(keys)), count).view(-1, count)
+
+
+def chi_square(cells, size):
+    """Whether all ``size`` values of ``cells`` are equally likely, five standard deviations allowed."""
+    expected = len(cells) / size
+    statistic = float(((cells.bincount(minlength=size) - expected) ** 2 / expected).sum())
+    return statistic < size - 1 + 5 * (2 * (size - 1)) ** 0.5
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 7, 10, 17, 64, 100, 1000, 4097])
+def test_places_are_a_permutation(count):
+    places = permutations(fold(torch.arange(20), count), count)
+    assert torch.equal(places.sort(-1).values, torch.arange(count).expand(20, count))
+    assert count < 5 or len({tuple(row) for row in places.tolist()}) == 20
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+def test_all_permutations_are_equally_likely(count):
+    every = list(itertools.permutations(range(count)))
+    number = {order: index for index, order in enumerate(every)}
+    places = permutations(fold(torch.arange(300 * len(every)), 7), count)
+    assert chi_square(torch.tensor([number[tuple(row)] for row in places.tolist()]), len(every))
+
+
+@pytest.mark.parametrize(("count", "bins"), [(10, 10), (64, 8), (1000, 10)])
+def test_two_members_of_larger_permutations_are_anywhere(count, bins):
+    keys = fold(torch.arange(4000), 3)
+    for members in ((0, 1), (0, count // 2), (count - 2, count - 1)):
+        first, second = (permuted(keys, torch.full_like(keys, member), count) for member in members)
+        gap = (second - first) % count - 1
+        assert chi_square(gap * 9 // (count - 1), 9), "a rotation alone would leave the gap as it is"
+        assert chi_square(first * bins // count, bins)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 10])
+def test_permutations_of_different_keys_are_independent(count):
+    states = fold(torch.arange(200 * count * count), 1)
+    first, second, next_state = (
+        permutations(keys, count) for keys in (fold(states, 4), fold(states, 5), fold(states.roll(1), 4))
+    )
+    for other in (second, next_state):
+        for member in range(count):
+            assert chi_square(first[:, member] * count + other[:, 0], count * count)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 1000])
+def test_a_place_is_a_function_of_key_and_member(count):
+    keys = fold(torch.arange(200), 0)
+    members = torch.arange(200) * 7 % count
+    places = permuted(keys, members, count)
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(permuted(keys[order], members[order], count), places[order])
+    assert torch.equal(permuted(keys.view(20, 10), members.view(20, 10), count).view(-1), places)
+    assert [int(permuted(k, m, count)) for k, m in zip(keys[:20], members[:20], strict=True)] == places[:20].tolist()
+
+
+def test_first_observations_of_two_variables_fill_the_square():
+    """Slices of the one in an order that is independent of the other's, not a rotation of it."""
+    groups = group(400, 100)
+    first, second = ((draw(groups, 0, name, 100)[0].view(400, 100) * 100).long() for name in (3, 4))
+    assert chi_square((first // 10 * 10 + second // 10).flatten(), 100)
+    pairs = torch.stack([first, second]).double()
+    inside = [float(torch.corrcoef(pairs[:, row])[0, 1]) for row in range(400)]
+    assert abs(statistics.mean(inside)) < 5 * 0.1 / 400**0.5
+    assert 0.08 < statistics.stdev(inside) < 0.12, "as 100 independent pairs have it"

@@ -9,11 +9,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_keys, check_number
+from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf, take_rows
 from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, controls_of
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.noise import fold, uniform
+from torchrl_pomdp.tensor_checks import check_keys
 
 __all__ = ["StateMemory"]
 

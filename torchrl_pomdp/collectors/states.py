@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_keys, check_number, shown
+from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number, shown
 from torchrl_pomdp.collectors.memory import StateMemory
 from torchrl_pomdp.envs.belief import StateGenerator
 from torchrl_pomdp.envs.generators import Mixture, draw_each
 from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.noise import seed_keys
+from torchrl_pomdp.tensor_checks import check_keys
 
 __all__ = ["PartSampler", "StateSampler", "training_states"]
 

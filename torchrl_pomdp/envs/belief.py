@@ -15,9 +15,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec
 
-from torchrl_pomdp.checks import check_callable, check_instance, check_keys, check_number, check_sequence, shown
+from torchrl_pomdp.checks import check_callable, check_instance, check_number, check_sequence, shown
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.noise import fingerprint
+from torchrl_pomdp.tensor_checks import check_keys
 
 __all__ = ["BeliefModel", "StateGenerator", "inverse_cdf", "put_rows", "take_rows"]
 

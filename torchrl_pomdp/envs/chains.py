@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_number, check_tensor, shown
+from torchrl_pomdp.checks import check_number, shown
+from torchrl_pomdp.tensor_checks import check_tensor
 
 __all__ = ["MAX_LEVELS", "checked_chain", "checked_costs", "damage_chain", "drifts", "off_diagonals", "overflowing_levels"]
 

@@ -12,21 +12,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import (
-    check_callable,
-    check_distributions,
-    check_flag,
-    check_instance,
-    check_integer,
-    check_keys,
-    check_number,
-    check_tensor,
-    shown,
-)
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_number, shown
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, generated, inverse_cdf
 from torchrl_pomdp.envs.repair import RepairModel
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.noise import fold, uniform
+from torchrl_pomdp.tensor_checks import check_distributions, check_keys, check_tensor
 
 __all__ = ["CalibratedStart", "FixedBelief", "InPart", "Mixture", "RandomState", "UniformStart", "draw_each"]
 

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_integer, check_tensor, check_text, shown
+from torchrl_pomdp.checks import check_integer, check_text, shown
+from torchrl_pomdp.tensor_checks import check_tensor
 
 __all__ = ["MAX_LOCATIONS", "Graph", "grid", "line"]
 

@@ -13,10 +13,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_pomdp.checks import check_device, check_instance, check_integer, check_number, check_tensor, check_text, shown
+from torchrl_pomdp.checks import check_instance, check_integer, check_number, check_text, shown
 from torchrl_pomdp.envs.graphs import Graph
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.tensor_checks import check_entries
+from torchrl_pomdp.tensor_checks import check_device, check_entries, check_tensor
 
 __all__ = ["Partition", "RepairPartition", "SinglePart"]
 

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import torch
 
-from torchrl_pomdp.checks import check_callable, check_device, check_flag, check_instance, check_text, shown
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_text, shown
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.chains import damage_chain
 from torchrl_pomdp.envs.generators import CalibratedStart, InPart, Mixture, RandomState, UniformStart
 from torchrl_pomdp.envs.graphs import Graph, grid, line
 from torchrl_pomdp.envs.partition import Partition, RepairPartition, SinglePart
 from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.tensor_checks import check_device
 
 __all__ = ["PRESETS", "Problem", "make_problem"]
 

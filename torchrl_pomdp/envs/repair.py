@@ -19,27 +19,21 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite
 
-from torchrl_pomdp.checks import (
-    check_device,
-    check_distributions,
-    check_dtype,
-    check_instance,
-    check_integer,
-    check_number,
-)
+from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf
 from torchrl_pomdp.envs.chains import checked_chain, checked_costs, drifts, off_diagonals, overflowing_levels
 from torchrl_pomdp.envs.graphs import Graph
 from torchrl_pomdp.envs.partition import Partition, RepairPartition, location_costs
 from torchrl_pomdp.envs.sums import multiply_first, sum_first
+from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype
 
 __all__ = ["REPAIR", "RepairModel"]
 
 REPAIR = 0
 """A robot's control *repair*; control ``1 + s`` moves along slot ``s`` of the graph."""
 
-MAX_JOINT = 1 << 16
-"""Largest number of joint controls or joint observations."""
+# Largest numbers of joint controls, which masks hold, and of joint observations, which are numbered.
+_MAX_CONTROLS, _MAX_OBSERVATIONS = 1 << 16, 1 << 31
 
 
 class RepairModel(BeliefModel):
@@ -58,7 +52,7 @@ class RepairModel(BeliefModel):
         discount: :math:`\alpha`.
 
     Keyword Args:
-        num_robots: R, at least 1; joint controls and joint observations are at most 65536.
+        num_robots: R, at least 1; at most 65536 joint controls.
         terminal_probability: :math:`\epsilon`, in [0, 1).
         partition: partition whose index becomes a feature.
         dtype: float32 or float64.
@@ -106,10 +100,9 @@ class RepairModel(BeliefModel):
         self.num_robot_controls = len(graph.control_names)
         self.num_controls = self.num_robot_controls**self.num_robots
         self.num_observations = self.num_levels**self.num_robots
-        if max(self.num_controls, self.num_observations) > MAX_JOINT:
+        if self.num_controls > _MAX_CONTROLS or self.num_observations > _MAX_OBSERVATIONS:
             raise ValueError(
-                f"num_robots is too large: {num_robots} robots have {self.num_controls} joint controls and "
-                f"{self.num_observations} joint observations, at most {MAX_JOINT} are allowed"
+                f"num_robots is too large: {num_robots} robots have {self.num_controls} joint controls, of {_MAX_CONTROLS} at most"
             )
         self.noise_dim = self.num_robots
         self.terminal_probability = check_number("terminal_probability", terminal_probability, "[0, 1)")

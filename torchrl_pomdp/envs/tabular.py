@@ -7,10 +7,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 
-from torchrl_pomdp.checks import check_device, check_distributions, check_dtype, check_tensor
 from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype, check_tensor
 
 __all__ = ["TabularModel", "tiger"]
 

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_keys
+from torchrl_pomdp.checks import check_choice, check_instance, check_integer
 from torchrl_pomdp.envs.belief import BeliefModel, take_rows
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
@@ -17,6 +17,7 @@ from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold
+from torchrl_pomdp.tensor_checks import check_keys
 
 __all__ = ["RolloutPolicy", "cheapest", "check_q_factors", "spread"]
 

@@ -10,11 +10,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_keys, shown
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, shown
 from torchrl_pomdp.envs.belief import BeliefModel, put_rows, take_rows
 from torchrl_pomdp.modules.compiling import compiled
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.truncation import Truncation
+from torchrl_pomdp.tensor_checks import check_keys
 
 __all__ = ["MAX_STEPS", "MAX_TRAJECTORIES", "Policy", "TerminalCost", "TruncatedRollout", "terminal_costs"]
 

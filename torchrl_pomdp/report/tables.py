@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_instance, check_integer, check_mapping, check_sequence, check_tensor, check_text
+from torchrl_pomdp.checks import check_instance, check_integer, check_mapping, check_sequence, check_text
 from torchrl_pomdp.evaluation import Comparison, Estimate, compare
+from torchrl_pomdp.tensor_checks import check_tensor
 
 __all__ = ["Result", "half_width", "interval_text", "is_iteration", "paired_ratios", "paired_table", "ratio_texts", "table"]
 

@@ -14,12 +14,13 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torchrl_pomdp.checks import check_choice, check_device, check_flag, check_instance, check_integer, check_path, check_text
+from torchrl_pomdp.checks import check_choice, check_flag, check_instance, check_integer, check_path, check_text
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.presets import PRESETS, Problem, make_problem
 from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, parse_tensors, tensor_bytes, write_bytes
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.modules import NeverRepairCost, PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
+from torchrl_pomdp.tensor_checks import check_device
 from torchrl_pomdp.trainers.architecture import BASE_POLICIES, ENCODERS, make_networks, make_values, partition_of
 
 __all__ = ["Checkpoint", "load_checkpoint", "open_run_folder", "problem_digest", "save_checkpoint"]

@@ -15,15 +15,7 @@ from torch import Tensor
 from torchrl.record import CSVLogger
 
 from torchrl_pomdp import __version__
-from torchrl_pomdp.checks import (
-    check_callable,
-    check_choice,
-    check_device,
-    check_flag,
-    check_instance,
-    check_integer,
-    check_path,
-)
+from torchrl_pomdp.checks import check_callable, check_choice, check_flag, check_instance, check_integer, check_path
 from torchrl_pomdp.collectors import OnLabels
 from torchrl_pomdp.config import EVALUATION_SEED, PolicyIterationConfig
 from torchrl_pomdp.envs import PRESETS, Problem, make_problem
@@ -32,6 +24,7 @@ from torchrl_pomdp.files import DamagedFileError, write_json
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import NeverRepairCost, PartitionedValue, Policy
+from torchrl_pomdp.tensor_checks import check_device
 from torchrl_pomdp.trainers.architecture import BASE_POLICIES, partition_of
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
