@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import sys
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import torch
@@ -20,7 +21,10 @@ __all__ = ["digest", "identity"]
 
 # What a module holds of its own; hooks, the mode and caches say nothing of what it computes.
 _MODULE_CONTENT = ("_parameters", "_buffers", "_modules")
-_PLAIN = (int, float, str, bytes, bool, type(None), tuple, frozenset, torch.dtype)
+_PLAIN = (int, float, complex, str, bytes, bool, type(None), torch.dtype)
+# Of these packages names say enough: versions are written down beside them.
+_BUILT_ON = {"torchrl_pomdp", "torch", "torchrl", "tensordict", "numpy", "tqdm"}
+_KNOWN = _BUILT_ON.union(sys.builtin_module_names, sys.stdlib_module_names)
 
 
 def identity(value: Any) -> str:
@@ -37,7 +41,11 @@ def digest(value: Any) -> str:
     """Hash of all that an object holds, 32 hexadecimal digits; the device does not matter.
 
     Tensors count with type, shape and numbers; modules with parameters, buffers and attributes; functions with their code,
-    defaults, closures and the plain global values that they read; other objects with their class and what they are pickled by.
+    defaults, closures and the globals that they read; other objects with their class and what they are pickled by. Functions
+    and classes of installed libraries that this one builds on count by name.
+
+    Raises:
+        TypeError: if an object holds what cannot be told, such as an open file.
 
     Examples:
         >>> digest({"a": torch.arange(3)}) == digest({"a": torch.arange(3)}), digest(1.0) == digest(2.0)
@@ -54,7 +62,7 @@ class _Walk:
         self._known: dict[int, tuple[Any, bytes]] = {}
 
     def digest(self, value: Any) -> bytes:
-        if isinstance(value, _PLAIN) and not isinstance(value, (tuple, frozenset)):
+        if type(value) in _PLAIN:
             return _hash("plain", type(value).__name__, repr(value))
         known = self._known.get(id(value))
         if known is None:
@@ -70,52 +78,91 @@ class _Walk:
         if isinstance(value, TensorDictBase):
             leaves = {str(key): value.get(key) for key in value.keys(include_nested=True, leaves_only=True)}
             return _hash("tensordict", str(tuple(value.batch_size)), self._items(leaves))
-        if isinstance(value, Mapping):
+        if type(value) in (dict, types.MappingProxyType):
             return _hash("mapping", self._items(value))
-        if isinstance(value, (list, tuple)):
+        if type(value) in (list, tuple):
             return _hash(type(value).__name__, *map(self.digest, value))
-        if isinstance(value, (set, frozenset)):
+        if type(value) in (set, frozenset):
             return _hash("set", *sorted(map(self.digest, value)))
         if isinstance(value, torch.device):
             return _hash("device")
         if isinstance(value, torch.Generator):
             return _hash("generator", _tensor(value.get_state()))
+        if isinstance(value, types.ModuleType):
+            return _hash("module", value.__name__)
         if isinstance(value, type):
-            return _hash("class", _name(value))
-        if callable(value) and not isinstance(value, nn.Module):
-            found = self._function(value)
-            if found is not None:
-                return found
-        return _hash("object", _name(type(value)), self._state(value))
-
-    def _function(self, value: Any) -> bytes | None:
-        """Digest of a function, method or partial; None for other objects that can be called."""
-        if isinstance(value, functools.partial):
-            return _hash("partial", *map(self.digest, (value.func, value.args, value.keywords)))
+            return self._class(value)
+        if isinstance(value, types.FunctionType):
+            return self._function(value)
         if isinstance(value, types.MethodType):
             return _hash("method", *map(self.digest, (value.__func__, value.__self__)))
         if isinstance(value, types.BuiltinFunctionType):
-            return _hash("builtin", _name(value))
-        if not isinstance(value, types.FunctionType):
-            return None
+            own = None if isinstance(value.__self__, types.ModuleType) else value.__self__
+            return _hash("builtin", _name(value), self.digest(own))
+        if isinstance(value, functools.partial):
+            return _hash("partial", *map(self.digest, (value.func, value.args, value.keywords)))
+        return _hash("object", self._class(type(value)), self._state(value))
+
+    def _class(self, value: type) -> bytes:
+        """A class by name, and by what it defines unless it is of a known package."""
+        if _is_known(value):
+            return _hash("class", _name(value))
+        own = {
+            name: getattr(entry, "__func__", entry)
+            for name, entry in vars(value).items()
+            if isinstance(entry, (types.FunctionType, staticmethod, classmethod, property, Tensor, list, dict, tuple, *_PLAIN))
+            and name not in ("__module__", "__doc__", "__dict__", "__weakref__", "__firstlineno__", "__static_attributes__")
+        }
+        getters = {name: entry.fget if isinstance(entry, property) else entry for name, entry in own.items()}
+        return _hash("class", _name(value), *(self.digest(base) for base in value.__bases__), self._items(getters))
+
+    def _function(self, value: types.FunctionType) -> bytes:
+        """A function by name, code, defaults, closure and the globals that it reads; of a known package by name and closure."""
         cells = [cell.cell_contents for cell in value.__closure__ or ()]
-        read = {n: value.__globals__.get(n) for n in value.__code__.co_names if isinstance(value.__globals__.get(n), _PLAIN)}
-        parts = (value.__defaults__, value.__kwdefaults__, cells, read)
-        return _hash("function", _name(value), self._code(value.__code__), *map(self.digest, parts))
+        bound = (value.__defaults__, value.__kwdefaults__, cells)
+        if _is_known(value):
+            return _hash("function", _name(value), *map(self.digest, bound))
+        names = {name for code in _codes(value.__code__) for name in code.co_names}
+        read = {name: value.__globals__[name] for name in names if name in value.__globals__}
+        return _hash("function", _name(value), self._code(value.__code__), *map(self.digest, (*bound, read)))
 
     def _code(self, code: types.CodeType) -> bytes:
         constants = [self._code(c) if isinstance(c, types.CodeType) else self.digest(c) for c in code.co_consts]
         return _hash("code", code.co_code, repr((code.co_names, code.co_varnames)), *constants)
 
     def _state(self, value: Any) -> bytes:
-        state = value.__getstate__()
+        """What an object would be pickled by."""
+        kind = type(value)
+        own_way = (kind.__reduce_ex__, kind.__reduce__) != (object.__reduce_ex__, object.__reduce__)
+        state = None if own_way else value.__getstate__()
         if isinstance(value, nn.Module) and isinstance(state, dict):
-            own = set(nn.Module().__dict__).difference(_MODULE_CONTENT)
-            state = {key: entry for key, entry in state.items() if key not in own}
-        return self.digest(state)
+            hooks = set(nn.Module().__dict__).difference(_MODULE_CONTENT)
+            return self.digest({key: entry for key, entry in state.items() if key not in hooks})
+        if state is not None and not isinstance(value, (list, tuple, dict, set, frozenset)):
+            return self.digest(state)
+        try:
+            reduced = value.__reduce_ex__(4)
+        except TypeError as error:
+            raise TypeError(f"what a {_name(kind)} holds cannot be told, so no run with it can be kept: {error}") from error
+        if isinstance(reduced, str):
+            return _hash("named", reduced)
+        make, given, state, *items = (*reduced, None)[:5]
+        return self.digest([make, given, state, *(list(entries) for entries in items if entries is not None)])
 
     def _items(self, entries: Mapping[Any, Any]) -> bytes:
         return _hash("items", *sorted(self.digest(key) + self.digest(entry) for key, entry in entries.items()))
+
+
+def _codes(code: types.CodeType) -> Iterator[types.CodeType]:
+    """A function's code and that of the functions in it."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _codes(constant)
+
+
+def _is_known(value: Any) -> bool:
+    return (value.__module__ or "builtins").partition(".")[0] in _KNOWN
 
 
 def _tensor(value: Tensor) -> bytes:

@@ -157,8 +157,8 @@ def check_distributions(name: str, value: Tensor) -> Tensor:
     if not value.numel():
         return value
     rounding = 8 * torch.finfo(value.dtype).eps
-    if not (value.amin() >= -rounding and value.amax() <= 1.0 + rounding):
-        wrong = value[~((value >= -rounding) & (value <= 1.0 + rounding))][0].item()
+    if not (value.amin() >= 0.0 and value.amax() <= 1.0 + rounding):
+        wrong = value[~((value >= 0.0) & (value <= 1.0 + rounding))][0].item()
         raise ValueError(f"{name} must hold probabilities in [0, 1], got {wrong:.6g} among them")
     # Along the memory: beliefs often have their first dimension innermost.
     sums = value.movedim(0, -1).sum(-2) if value.ndim > 1 and value.stride(0) == 1 else value.sum(-1)

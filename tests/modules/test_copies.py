@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import MultiSyncCollector
 
 from torchrl_pomdp.collectors import PartSampler, PolicyEvaluation, RolloutImprovement
 from torchrl_pomdp.envs import BeliefEnv, make_problem
@@ -51,13 +51,15 @@ POLICY, VALUE = networks()
 MAKE = {
     "TruncatedRollout": lambda: TruncatedRollout(MODEL, GREEDY),
     "TruncatedRollout, cut": lambda: TruncatedRollout(
-        MODEL, POLICY, truncation=OnEntering((3, 4, 5)), terminal_cost=VALUE
+        MODEL, POLICY, truncation=OnEntering((3, 4, 5)), terminal_cost=VALUE, max_steps=20
     ),
     "RolloutPolicy": lambda: RolloutPolicy(MODEL, GREEDY, trajectories=3),
     "RolloutPolicy, adaptive": lambda: RolloutPolicy(MODEL, GREEDY, leaves="observation", allocation="adaptive", seed=4, **CUT),
     "RolloutPolicy of one": lambda: RolloutPolicy(MODEL, RolloutPolicy(MODEL, GREEDY, **CUT), **CUT),
     "MultistepLookahead": lambda: MultistepLookahead(RolloutPolicy(MODEL, GREEDY, **CUT), 2, 2, 0.3),
-    "ParallelRollout": lambda: ParallelRollout([RolloutPolicy(MODEL, base(MODEL), **CUT) for base in (GreedyRepair, UrgencyRepair)]),
+    "ParallelRollout": lambda: ParallelRollout(
+        [RolloutPolicy(MODEL, base(MODEL), **CUT) for base in (GreedyRepair, UrgencyRepair)]
+    ),
     "PolicyCost": lambda: PolicyCost(MODEL, POLICY, seed=2, **CUT),
     "PolicyCost of a rollout": lambda: PolicyCost(MODEL, RolloutPolicy(MODEL, GREEDY, **CUT), **CUT),
     "PartitionedPolicy": lambda: PartitionedPolicy(
@@ -65,17 +67,16 @@ MAKE = {
     ),
     "PartitionedValue": lambda: PartitionedValue([NEVER] * 3 + list(VALUE.values)[3:]),
     "r_nt": lambda: r_nt(PROBLEM, GREEDY, trajectories=3),
-    "r_t": lambda: r_t(PROBLEM, GREEDY, SteadyStateCost(MODEL), trajectories=3),
-    "r_t with values": lambda: r_t(PROBLEM, POLICY, VALUE, trajectories=3),
-}  # fmt: skip
+    "r_t": lambda: r_t(PROBLEM, GREEDY, SteadyStateCost(MODEL), trajectories=3, max_steps=20),
+    "r_t with values": lambda: r_t(PROBLEM, POLICY, VALUE, trajectories=3, max_steps=20),
+}
 WAYS = {
     "deepcopy": copy.deepcopy,
     "pickle": lambda module: pickle.loads(pickle.dumps(module)),
-    "torch": lambda module: pickle.loads(pickle.dumps(copy.deepcopy(copy.deepcopy(module)))),
 }
 
 
-def results(module, keys=None):
+def results(module):
     y = STATES.clone()
     if isinstance(module, TruncatedRollout):
         return {"cost": module(y, torch.arange(len(y)))}
@@ -122,7 +123,7 @@ def test_a_copy_is_another_one(name, way):
 
 @pytest.mark.parametrize("way", ["deepcopy", "pickle"])
 def test_changing_the_weights_of_a_copy_changes_it_alone(way):
-    original = RolloutPolicy(MODEL, networks()[0], trajectories=3)
+    original = RolloutPolicy(MODEL, networks()[0], trajectories=3, max_steps=20, terminal_cost=NEVER)
     copied, expected = WAYS[way](original), results(original)
     with torch.no_grad():
         for parameter in copied.parameters():
@@ -147,7 +148,7 @@ def test_what_is_to_be_compiled_copies_too(way):
 
 
 def test_shared_parts_stay_shared_within_a_copy():
-    policy = copy.deepcopy(RolloutPolicy(MODEL, POLICY, truncation=AfterSteps(9), terminal_cost=VALUE))
+    policy = copy.deepcopy(RolloutPolicy(MODEL, POLICY, truncation=AfterSteps(9), terminal_cost=VALUE, max_steps=20))
     encoders = {id(network.encoder) for network in policy.cost_to_go.base_policy.policies}
     assert len(encoders) == 1, "networks that share an encoder are evaluated together"
     assert policy.model is policy.cost_to_go.model
@@ -169,8 +170,9 @@ def test_rollout_policies_are_base_policies_of_the_label_collectors(kind):
         total_frames=12,
     )
     batch = next(iter(collector))
-    expected = label(MODEL, RolloutPolicy(MODEL, GREEDY, **CUT), **CUT)(MODEL.with_features(states(torch.arange(12))))
-    for key in label.out_keys:
+    labeller = label(MODEL, RolloutPolicy(MODEL, GREEDY, **CUT), **CUT)
+    expected = labeller(MODEL.with_features(states(torch.arange(12))))
+    for key in labeller.out_keys:
         assert torch.equal(batch[key], expected[key])
     assert base.simulated_steps > 0
     assert collector.labeller is not base
@@ -197,12 +199,16 @@ def test_policy_iteration_starts_from_a_rollout_policy():
 
 def test_a_rollout_policy_is_the_actor_of_several_workers():
     def make_env():
-        return BeliefEnv(PROBLEM.model, PROBLEM.start, seed=0)
+        problem = make_problem("line3")
+        return BeliefEnv(problem.model, problem.start, seed=0)
 
-    options = {"frames_per_batch": 12, "total_frames": 12}
-    (alone,) = Collector(make_env, RolloutPolicy(MODEL, GREEDY, **CUT), **options)
     workers = MultiSyncCollector(
-        [make_env], RolloutPolicy(MODEL, GREEDY, **CUT), use_buffers=False, cat_results="stack", **options
+        [make_env],
+        RolloutPolicy(MODEL, GREEDY, **CUT),
+        frames_per_batch=12,
+        total_frames=12,
+        use_buffers=False,
+        cat_results="stack",
     )
     try:
         batches = [batch.clone() for batch in workers]
@@ -212,4 +218,4 @@ def test_a_rollout_policy_is_the_actor_of_several_workers():
     again = RolloutPolicy(MODEL, GREEDY, **CUT)(data.select("belief", "location").clone())
     assert torch.equal(data["action"], again["action"]), "its decisions are those of the states"
     assert data["action_mask"].gather(1, data["action"].unsqueeze(1)).all()
-    assert data["action"].shape == alone.reshape(-1)["action"].shape
+    assert len(data) == 12

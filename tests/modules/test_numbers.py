@@ -103,7 +103,7 @@ def test_terminal_costs_that_are_no_numbers_are_refused(linear20, beside, user, 
 def test_wherever_a_trajectory_is_cut(linear20, beside, rule):
     cut = {"truncation": rule, "terminal_cost": lambda y: torch.full(y.batch_size, torch.nan), "max_steps": 20}
     for user in ("control leaves", "policy cost", "rollout"):
-        with pytest.raises(ValueError, match="^terminal_cost must give finite costs, got nan"):
+        with pytest.raises(ValueError, match=r"^terminal_cost must give finite costs, got nan"):
             users(linear20.model, cut)[user](beside.clone())
 
 
@@ -151,11 +151,12 @@ def test_weights_that_are_no_numbers_are_refused(linear20, kind, encoder, value)
     partitioned = PartitionedPolicy([network] * 6) if kind == "logits" else PartitionedValue([network] * 6)
     with pytest.raises(ValueError, match=f"^{kind} of a network must be finite"):
         partitioned(y.copy())
+    if kind == "logits":
+        policy, options = network, {}
+    else:
+        policy, options = GreedyRepair(model), {"max_steps": 3, "terminal_cost": partitioned}
     with pytest.raises(ValueError, match=f"^{kind} of a network must be finite"):
-        if kind == "logits":
-            discounted_costs(model, network, linear20.start, num_states=3)
-        else:
-            discounted_costs(model, GreedyRepair(model), linear20.start, num_states=3, max_steps=3, terminal_cost=partitioned)
+        discounted_costs(model, policy, linear20.start, num_states=3, **options)
 
 
 def overflowing(cost, dtype=torch.float32, length=20, robots=1):
@@ -219,7 +220,7 @@ def test_a_state_without_a_legal_control_is_refused():
     for user in (policy, MultistepLookahead(policy, 2), ParallelRollout([policy])):
         with pytest.raises(ValueError, match="action_mask must allow at least one control in every state"):
             user(y.clone())
-    with pytest.raises(ValueError, match="^logits of a network must be finite"):
+    with pytest.raises(ValueError, match=r"^logits of a network must be finite"):
         PolicyNetwork(FlatEncoder(model), 3, (4,), generator=torch.Generator().manual_seed(0))(model.with_features(y))
 
 

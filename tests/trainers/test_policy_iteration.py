@@ -9,7 +9,7 @@ import torch
 from torchrl.trainers import Trainer
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
-from torchrl_pomdp.envs import BeliefEnv, Problem, RandomState, RepairModel, UniformStart, damage_chain, line, make_problem
+from torchrl_pomdp.envs import BeliefEnv, Problem, RepairModel, UniformStart, damage_chain, line, make_problem
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import (
     GreedyRepair,
@@ -386,4 +386,4 @@ def test_value_networks_learn_costs_of_all_magnitudes(linear20):
 def test_models_without_a_partition_are_refused():
     model = RepairModel(line(3), damage_chain((0.0, 0.02)), (0.0, 1.0, 2.0), 0.99)
     with pytest.raises(ValueError, match="has no partition"):
-        papi_nt(Problem("bare", model, UniformStart(model), (RandomState(model),)), TINY, GreedyRepair(model))
+        papi_nt(Problem("bare", model, UniformStart(model), ()), TINY, GreedyRepair(model))

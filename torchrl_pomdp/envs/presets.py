@@ -55,7 +55,8 @@ class Problem:
         for part, generator in enumerate(self.training):
             check_callable(f"training[{part}]", generator)
         parts = 1 if self.model.partition is None else self.model.partition.num_parts
-        if len(self.training) != parts:
+        # Without a partition there are no parts to train; what needs them says so.
+        if len(self.training) != parts and not (self.model.partition is None and not self.training):
             raise ValueError(f"training must hold {parts} generators, one for each part, got {len(self.training)}")
 
 

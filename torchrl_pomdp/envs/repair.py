@@ -102,7 +102,7 @@ class RepairModel(BeliefModel):
         self.num_observations = self.num_levels**self.num_robots
         if self.num_controls > _MAX_CONTROLS or self.num_observations > _MAX_OBSERVATIONS:
             raise ValueError(
-                f"num_robots is too large: {num_robots} robots have {self.num_controls} joint controls, of {_MAX_CONTROLS} at most"
+                f"num_robots must leave at most {_MAX_CONTROLS} joint controls, got {num_robots} with {self.num_controls}"
             )
         self.noise_dim = self.num_robots
         self.terminal_probability = check_number("terminal_probability", terminal_probability, "[0, 1)")

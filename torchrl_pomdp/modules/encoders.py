@@ -258,12 +258,17 @@ def _robot_output(
 
 def _offsets(graph: Graph) -> Tensor:
     """Number of the offset from every location to every location, ``[L, L]``, numbered row by row."""
-    across, down = (c.unsqueeze(0) - c.unsqueeze(1) for c in (graph.columns, graph.rows))
-    return (_ranks(down) * across.numel() + _ranks(across)).unique(return_inverse=True)[1]
+    across, down = (c.double().unsqueeze(0) - c.double().unsqueeze(1) for c in (graph.columns, graph.rows))
+    for rounding in (_SAME, 0.0):
+        offsets = (_ranks(down, rounding) * across.numel() + _ranks(across, rounding)).unique(return_inverse=True)[1]
+        # Locations that are closer than the rounding must not be taken for one.
+        if bool((offsets.sort(-1).values.diff() > 0).all()):
+            break
+    return offsets
 
 
-def _ranks(values: Tensor) -> Tensor:
+def _ranks(values: Tensor, rounding: float) -> Tensor:
     """Numbers from the smallest on, those that differ by rounding alone being the same."""
-    ordered, inverse = values.double().unique(return_inverse=True)
-    larger = ordered.diff() > _SAME * float(ordered.abs().max().clamp_min(1.0))
-    return torch.nn.functional.pad(larger.cumsum(0), (1, 0))[inverse]
+    ordered, inverse = values.unique(return_inverse=True)
+    larger = ordered.diff() > rounding * float(ordered.abs().max())
+    return nn.functional.pad(larger.cumsum(0), (1, 0))[inverse]

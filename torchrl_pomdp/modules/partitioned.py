@@ -33,13 +33,21 @@ class _Partitioned(TensorDictModuleBase):
         for part, member in enumerate(members):
             check_instance(f"{name}[{part}]", member, TensorDictModuleBase)
         super().__init__()
-        local: list[Any] = list(members)
-        read = {str(key): None for member in local for key in member.in_keys}
-        self.in_keys = [*read, "partition"]
-        written = [set(member.out_keys) for member in local]
-        self.out_keys = [key for key in local[0].out_keys if all(key in keys for keys in written)]
         self._name = name
         setattr(self, name, nn.ModuleList(members))
+
+    # Local modules may be replaced, by others that read or write other entries.
+
+    @property
+    def in_keys(self) -> list[str]:
+        """What the local modules read, and the part."""
+        return [*{str(key): None for member in getattr(self, self._name) for key in member.in_keys}, "partition"]
+
+    @property
+    def out_keys(self) -> list[str]:
+        """What all local modules write."""
+        first, *others = (list(member.out_keys) for member in getattr(self, self._name))
+        return [key for key in first if all(key in keys for keys in others)]
 
     # Which rows go where depends on the data, which a compiler cannot follow.
     @torch.compiler.disable

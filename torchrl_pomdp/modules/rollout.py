@@ -301,7 +301,7 @@ class TruncatedRollout(nn.Module):
         """The terminal cost of the rows ``index`` of ``live``, with features that are made for it here alone."""
         if index.numel():
             y = self.model.derive(take_rows(live.y, index), _read_by(terminal_cost))
-            cost = terminal_costs(terminal_cost, y) * self._discounts[live.age[index]]
+            cost = terminal_costs(terminal_cost, y).to(total.dtype) * self._discounts[live.age[index]]
             total.index_add_(0, live.number[index], cost)
 
 

@@ -167,9 +167,8 @@ def load_checkpoint(path: str | PathLike[str], *, device: torch.device | str = "
     path, device = check_path("path", path), check_device("device", device)
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path}")
-    content = load_tensors(path)
     try:
-        return _parse(content, device)
+        return _parse(load_tensors(path), device)
     except Exception as error:  # what a foreign file holds can be anything
         raise DamagedFileError(f"{path} is damaged or no checkpoint of this library: {error}") from error
 
