@@ -11,7 +11,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_pomdp.checks import check_choice, check_integer, check_seed
-from torchrl_pomdp.config import EVALUATION_SEED, PolicyIterationConfig
+from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
 from torchrl_pomdp.envs import PRESETS, BeliefEnv, Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import check_folder, write_json
@@ -79,7 +79,7 @@ def _trajectory_figure(problem: Problem, policy: Policy) -> Figure:
 
 def evaluate(command: Evaluate) -> None:
     """Compare a policy with the base policies; print the table."""
-    check_integer("states", command.states, 1, 10**9)
+    check_integer("states", command.states, 1, MAX_STATES)
     check_integer("trajectories", command.trajectories, 1, 10**6)
     check_seed("seed", command.seed)
     problem, policy, name = _named_policy(command, check_device("device", command.device))

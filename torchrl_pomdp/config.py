@@ -7,15 +7,17 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from torchrl_pomdp.checks import check_choice, check_flag, check_integer, check_number, check_seed, check_sizes
 
-__all__ = ["EVALUATION_SEED", "PolicyIterationConfig"]
+__all__ = ["EVALUATION_SEED", "MAX_STATES", "PolicyIterationConfig"]
 
 # Start states of evaluations are drawn under this seed, whatever the training's.
 EVALUATION_SEED = 20200
 
+# Most start states of an evaluation: their costs are kept together.
+MAX_STATES = 10**8
 # Counts, from 1, with their largest values: above any use, below what no machine could hold or finish.
 _COUNTS = {
     "iterations": 1000, "samples_per_part": 10**9, "trajectories": 10**6, "max_steps": 10**6, "memory_capacity": 10**9,
-    "value_samples": 10**9, "batch_size": 10**7, "epochs": 10**6, "least_steps": 10**9, "validation_states": 10**9,
+    "value_samples": 10**9, "batch_size": 10**7, "epochs": 10**6, "least_steps": 10**9, "validation_states": MAX_STATES,
 }  # fmt: skip
 _INTERVALS = {"visited_share": "[0, 1]", "exploration": "[0, 1]", "visits_per_label": "(0, 1000]", "learning_rate": "(0, 1]"}
 _WIDEST, _DEEPEST = 1 << 14, 16

@@ -10,6 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_text
+from torchrl_pomdp.config import MAX_STATES
 from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.noise import fold, seed_keys
@@ -18,8 +19,6 @@ from torchrl_pomdp.tensor_checks import check_tensor
 
 __all__ = ["Comparison", "Estimate", "compare", "discounted_costs", "estimate"]
 
-# Most start states of an evaluation: their costs are kept together.
-MAX_STATES = 10**8
 # Half width of a 95 % interval in standard errors.
 _Z95 = 1.96
 

@@ -68,6 +68,9 @@ def write_bytes(path: str | PathLike[str], content: bytes) -> None:
             file.flush()
             os.fsync(handle)
         os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -169,8 +172,7 @@ def claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
     """
     path = check_path("path", path)
     given = json.loads(_json("identity", check_instance("identity", identity, dict)))
-    if not path.is_file():
-        write_json(path, given)
+    if not path.is_file() and _write_new(path, _json("identity", given).encode()):
         return
     found = read_json(path)
     nothing = object()
@@ -178,6 +180,21 @@ def claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
     if differing:
         what = ", ".join(differing)
         raise ValueError(f"run folder {path.parent} holds another run, which differs in {what}: name another folder")
+
+
+def _write_new(path: Path, content: bytes) -> bool:
+    """Write a file that nobody else has written meanwhile, whole or not at all; False where somebody has."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
+    write_bytes(temporary, content)
+    try:
+        # Unlike a renaming, a link does not replace what is there.
+        os.link(temporary, path)
+    except FileExistsError:
+        return False
+    finally:
+        temporary.unlink(missing_ok=True)
+    return True
 
 
 def save_tensors(path: str | PathLike[str], content: dict[str, Any]) -> None:
@@ -268,6 +285,9 @@ def _check_archive(content: bytes) -> None:
     """Raise unless ``content`` is an archive of stored files that agree with their check sums."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         files = archive.infolist()
+        # Readers differ in which of several archives they take: it must be one, from the first byte to the last.
+        if not files or min(file.header_offset for file in files) != 0 or content[-22:-18] != b"PK\5\6":
+            raise ValueError("there is something before or behind the archive")
         # Tensors are stored as they are; a small archive that unfolds to a huge one is none of ours.
         if any(file.compress_type != zipfile.ZIP_STORED or file.file_size > len(content) for file in files):
             raise ValueError("the archive holds compressed files")

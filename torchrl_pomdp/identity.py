@@ -137,7 +137,10 @@ class _Walk:
         state = None if own_way else value.__getstate__()
         if isinstance(value, nn.Module) and isinstance(state, dict):
             hooks = set(nn.Module().__dict__).difference(_MODULE_CONTENT)
-            return self.digest({key: entry for key, entry in state.items() if key not in hooks})
+            kept = {key: entry for key, entry in state.items() if key not in hooks}
+            return self.digest(
+                [kept, *(list(state[key].values()) for key in sorted(hooks) if key.endswith("hooks") and state[key])]
+            )
         if state is not None and not isinstance(value, (list, tuple, dict, set, frozenset)):
             return self.digest(state)
         try:

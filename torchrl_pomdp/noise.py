@@ -82,7 +82,7 @@ def permuted(keys: Tensor, members: Tensor, count: int) -> Tensor:
     without the others. The rotation alone makes every place equally likely, and is all there is to permute for two members.
 
     Args:
-        keys: int64 ``[*B]``; equal keys have the same permutation, those of different keys are independent.
+        keys: int64 ``[*B]`` as :func:`fold` gives them; equal keys have the same permutation, different ones independent ones.
         members: int64 ``[*B]`` in 0..count-1.
         count: number of members, at most 2**24.
 

@@ -113,7 +113,12 @@ def check_tensor(
             value = torch.as_tensor(value, dtype=torch.float64) if exact else read
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise TypeError(f"{name} must be a tensor of numbers, got {shown(value)}") from error
-    if (dtype is not None and value.dtype != dtype) or value.is_complex() or value.is_quantized:
+    if (
+        (dtype is not None and value.dtype != dtype)
+        or value.is_complex()
+        or value.is_quantized
+        or (dtype is None and value.dtype == torch.bool)
+    ):
         raise TypeError(f"{name} must be a tensor of {dtype or 'real numbers'}, got {value.dtype}")
     if shape is not None and (
         len(shape) != value.ndim or any(s not in (None, n) for s, n in zip(shape, value.shape, strict=True))

@@ -84,19 +84,18 @@ USERS = list(users(small_model(), {}))
 @pytest.fixture(scope="module")
 def beside(linear20):
     """States whose robot stands beside location 5, and other ones."""
-    y = linear20.start(torch.arange(24))
-    y["location"][:12] = 4
+    y = linear20.start(torch.arange(12))
+    y["location"][:6] = 4
     return linear20.model.with_features(y)
 
 
-@pytest.mark.parametrize("value", BROKEN)
+@pytest.mark.parametrize("value", BROKEN[:2])
 @pytest.mark.parametrize("user", USERS)
 def test_terminal_costs_that_are_no_numbers_are_refused(linear20, beside, user, value):
-    for where in WHERE:
-        for form in (lambda cost: cost, Writer):
-            cut = {"truncation": AfterSteps(1), "terminal_cost": form(broken_cost(linear20.model, value, where))}
-            with pytest.raises(ValueError, match=rf"^terminal_cost must give finite costs, got {value}"):
-                users(linear20.model, cut)[user](beside.clone())
+    for where, form in (("all", Writer), ("one place", Writer), ("one place", lambda cost: cost), ("a tenth", Writer)):
+        cut = {"truncation": AfterSteps(1), "terminal_cost": form(broken_cost(linear20.model, value, where))}
+        with pytest.raises(ValueError, match=rf"^terminal_cost must give finite costs, got {value}"):
+            users(linear20.model, cut)[user](beside.clone())
 
 
 @pytest.mark.parametrize("rule", [AfterSteps(0), OnEntering((3, 4, 5)), None])

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -9,7 +10,18 @@ import torch
 from torchrl.trainers import Trainer
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
-from torchrl_pomdp.envs import BeliefEnv, Problem, RepairModel, UniformStart, damage_chain, line, make_problem
+from torchrl_pomdp.envs import (
+    BeliefEnv,
+    InPart,
+    Problem,
+    RandomState,
+    RepairModel,
+    RepairPartition,
+    UniformStart,
+    damage_chain,
+    line,
+    make_problem,
+)
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import (
     GreedyRepair,
@@ -381,6 +393,21 @@ def test_value_networks_learn_costs_of_all_magnitudes(linear20):
     assert float((found - exact).abs().mean() / exact.mean()) < 0.2
     never = NeverRepairCost(model).costs(y)
     assert float(((found - exact).abs() / never).mean()) < 0.2 * float(((never - exact) / never).mean())
+
+
+def test_states_where_nothing_is_to_be_paid_spoil_no_network():
+    """The first damage costs nothing and does not grow: many states have a pessimistic cost of zero."""
+    partition = RepairPartition(line(3), torch.tensor((0.0, 1.0, 5.0)))
+    model = RepairModel(line(3), damage_chain((0.0, 0.0)), (0.0, 0.0, 5.0), 0.9, partition=partition)
+    training = tuple(InPart(model, RandomState(model), part) for part in range(6))
+    problem = Problem("free", model, UniformStart(model), training)
+    scale = NeverRepairCost(model).costs(torch.cat([states(torch.arange(50)) for states in training]))
+    assert 0 < int((scale == 0).sum()) < 300
+    (iteration,) = run(problem, replace(TINY, samples_per_part=60, value_samples=60), papi_t)
+    for network in (iteration.policy, iteration.value):
+        assert all(bool(torch.isfinite(parameter).all()) for parameter in network.parameters())
+    assert all(math.isfinite(loss) for record in iteration.records.values() for loss in record.losses.values())
+    assert math.isfinite(iteration.comparison.difference.mean)
 
 
 def test_models_without_a_partition_are_refused():

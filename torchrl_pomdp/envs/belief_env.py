@@ -127,6 +127,8 @@ class BeliefEnv(EnvBase):
         shape = (*tensordict.batch_size, self.model.noise_dim)
         noise = torch.rand(shape, generator=self.rng, dtype=self.model.dtype, device=self.device)
         cost, nxt = self.model.advance(tensordict, u, noise)
+        if not bool(torch.isfinite(cost).all()):
+            raise ValueError(f"expected_cost of the model must be finite, got {cost[~torch.isfinite(cost)][0].item()}")
         terminal = tensordict.get("terminated", None)
         terminal = self.model.is_terminal(tensordict) if terminal is None else terminal.squeeze(-1)
         self._controls.show(nxt.get("action_mask"))

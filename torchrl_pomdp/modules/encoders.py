@@ -58,6 +58,8 @@ class Encoder(nn.Module):
 
 # Offsets that differ by less than this fraction of the graph's size are the same: coordinates are rounded.
 _SAME = 1e-5
+# Most features of a window: a first layer of a hundred million weights.
+_MOST_FEATURES = 1 << 19
 
 
 def transformed(tensor: Tensor) -> bool:
@@ -92,7 +94,8 @@ class FlatEncoder(Encoder):
         blocks = []
         for key in self.keys:
             # [., N] and its transpose: entries kept as planes are turned by one fast transposition.
-            leaf = y.get(key).movedim(0, -1).flatten(0, -2)
+            leaf = y.get(key)
+            leaf = leaf.unsqueeze(0) if leaf.ndim == 1 else leaf.movedim(0, -1).flatten(0, -2)
             classes = self.classes[key]
             if classes is not None:
                 leaf = (leaf.unsqueeze(1) == torch.arange(classes, device=leaf.device).unsqueeze(-1)).flatten(0, 1)
@@ -131,6 +134,10 @@ class RelativeEncoder(Encoder):
         self.dtype = model.dtype
         size, levels = self.num_locations, self.num_levels
         offsets = _offsets(model.graph)
+        if int(offsets.max()) * levels > _MOST_FEATURES:
+            raise ValueError(
+                f"model has {int(offsets.max()) + 1} different offsets between locations, too many: use FlatEncoder"
+            )
         # [L, L * K] for a robot at a location: which feature each number of the belief is; and the location's own.
         columns = (offsets.unsqueeze(-1) * levels + torch.arange(levels)).flatten(1)
         places = (int(offsets.max()) + 1) * levels + torch.arange(size)
@@ -263,8 +270,10 @@ def _offsets(graph: Graph) -> Tensor:
         offsets = (_ranks(down, rounding) * across.numel() + _ranks(across, rounding)).unique(return_inverse=True)[1]
         # Locations that are closer than the rounding must not be taken for one.
         if bool((offsets.sort(-1).values.diff() > 0).all()):
-            break
-    return offsets
+            return offsets
+    raise ValueError(
+        "model must have a graph whose columns and rows tell its locations apart from everywhere, got one that rounds"
+    )
 
 
 def _ranks(values: Tensor, rounding: float) -> Tensor:

@@ -17,7 +17,7 @@ from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold
-from torchrl_pomdp.tensor_checks import check_keys
+from torchrl_pomdp.tensor_checks import check_distributions, check_keys
 
 __all__ = ["RolloutPolicy", "cheapest", "check_q_factors", "spread"]
 
@@ -179,7 +179,7 @@ class RolloutPolicy(TensorDictModuleBase):
         cost = self.cost_to_go(successors, scenarios, self.trajectories) * weight
         total = torch.zeros(members.numel() * u.numel(), dtype=cost.dtype, device=cost.device)
         total.index_add_(0, each * u.numel() + pair, cost)
-        return model.expected_cost(pairs, u) + model.discount * total.view(members.numel(), -1)
+        return (model.expected_cost(pairs, u) + model.discount * total.view(members.numel(), -1)).to(model.dtype)
 
     def _scenarios(self, pair: Tensor, each: Tensor, members: Tensor, keys: Tensor) -> Scenarios:
         """Scenarios of trajectory ``members[each]`` of the pairs ``pair``, whose states have the keys ``keys`` ``[P]``."""
@@ -201,7 +201,7 @@ class RolloutPolicy(TensorDictModuleBase):
     def _enumerated(self, pairs: TensorDictBase, u: Tensor, members: Tensor, keys: Tensor) -> _Leaves:
         """A leaf for every pair, observation of positive probability and trajectory, weighted by the probability."""
         model, device = self.model, u.device
-        probs = model.observation_probs(pairs, u)
+        probs = check_distributions("observation_probs", model.observation_probs(pairs, u))
         pair, observation = (probs > 0).nonzero(as_tuple=True)
         weight = probs[pair, observation].repeat_interleave(members.numel())
         each = torch.arange(members.numel(), device=device).repeat(pair.numel())

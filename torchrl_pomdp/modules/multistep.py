@@ -11,6 +11,7 @@ from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief import inverse_cdf, take_rows
 from torchrl_pomdp.modules.lookahead import RolloutPolicy, cheapest, check_q_factors
 from torchrl_pomdp.noise import fold, uniform
+from torchrl_pomdp.tensor_checks import check_distributions
 
 __all__ = ["MultistepLookahead"]
 
@@ -85,7 +86,8 @@ class MultistepLookahead(TensorDictModuleBase):
         state, u = mask.nonzero(as_tuple=True)
         pairs = take_rows(y, state)
         pair, observation, weight = self._observations(
-            model.observation_probs(pairs, u), fold(fold(keys[state], _OBSERVATIONS), depth)
+            check_distributions("observation_probs", model.observation_probs(pairs, u)),
+            fold(fold(keys[state], _OBSERVATIONS), depth),
         )
         successors = model.estimator(take_rows(pairs, pair), u[pair], observation)
         value = self._values(successors, keys[state[pair]], depth - 1)
@@ -104,7 +106,10 @@ class MultistepLookahead(TensorDictModuleBase):
     def _worthwhile(self, y: TensorDictBase, keys: Tensor) -> Tensor:
         """Controls that are expanded, bool ``[N, U]``: the legal ones that are not dominated."""
         if self.margin is None:
-            return self.model.action_mask(y)
+            mask = self.model.action_mask(y)
+            if not bool(mask.any(-1).all()):
+                raise ValueError("action_mask must allow at least one control in every state, got none")
+            return mask
         q = self.policy.q_factors(y, keys)
         best = q.amin(-1, keepdim=True)
         return torch.isfinite(q) & (q <= best + self.margin * best.abs())

@@ -245,7 +245,7 @@ class TruncatedRollout(nn.Module):
         while live.number.numel():
             ended = int(live.ended.sum())
             if ended <= _RENEW_FRACTION * live.ended.numel():
-                live = self._step(live, count, total)
+                live = self._checked_step(live, count, total)
                 steps += live.ended.numel() - ended
                 continue
             free = live.ended.nonzero().squeeze(-1)[: max(0, size - waiting)]
@@ -272,10 +272,19 @@ class TruncatedRollout(nn.Module):
         ended = torch.zeros_like(number, dtype=torch.bool)
         return self._end(_Live(start, scenarios.rows(number), number, age, ended, memory), total)
 
+    def _checked_step(self, live: _Live, count: int, total: Tensor) -> _Live:
+        """:meth:`_step`; what fails in it for an illegal control says so, at no cost where nothing fails."""
+        try:
+            return self._step(live, count, total)
+        except (IndexError, RuntimeError):
+            y = live.y.copy()
+            self.model.check_controls(y, controls_of("base_policy", self.base_policy, y.copy()))
+            raise
+
     def _step(self, live: _Live, count: int, total: Tensor) -> _Live:
         """One step of all live trajectories; those that have ended add no cost and grow no older."""
         cost, y, scenarios = self._transition(live.y, live.scenarios, live.age, count)
-        total.index_add_(0, live.number, cost.masked_fill(live.ended, 0.0))
+        total.index_add_(0, live.number, cost.masked_fill(live.ended, 0.0).to(total.dtype))
         return self._end(live._replace(y=y, scenarios=scenarios, age=live.age + ~live.ended), total)
 
     def _policy_and_step(
@@ -283,6 +292,8 @@ class TruncatedRollout(nn.Module):
     ) -> tuple[Tensor, TensorDictBase, Scenarios]:
         """Discounted stage cost ``[N]``, next feature states and scenarios of rows that have made ``age`` ``[N]`` steps."""
         u = controls_of("base_policy", self.base_policy, y)
+        if not torch.compiler.is_compiling():
+            _check_range(u, self.model.num_controls)
         noise, scenarios = scenarios.draw(age, self.model.observed(y, u), count)
         cost, nxt = self.model.advance(y, u, noise)
         return cost * self._discounts[age], nxt, scenarios
@@ -315,6 +326,13 @@ def _check_rest(model: BeliefModel, max_steps: int, truncation: Truncation | Non
             f"max_steps={max_steps} needs a terminal_cost, got None: the first stage cut weighs {weight:.2g}, more than "
             f"{_INSIGNIFICANT}; pass ZeroCost() to add nothing"
         )
+
+
+def _check_range(u: Tensor, num_controls: int) -> None:
+    """Raise unless ``u`` are controls of the model: others would be taken for some of these."""
+    low, high = u.aminmax() if u.numel() else (0, 0)
+    if u.dtype != torch.int64 or not 0 <= int(low) <= int(high) < num_controls:
+        raise ValueError(f"base_policy must write int64 actions 0..{num_controls - 1}, got {u.dtype} from {low} to {high}")
 
 
 def _read_by(reader: Policy | TerminalCost) -> tuple[str, ...] | None:

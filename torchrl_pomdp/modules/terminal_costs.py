@@ -14,7 +14,7 @@ from torchrl_pomdp.envs.belief import BeliefModel, take_rows
 from torchrl_pomdp.envs.partition import location_costs
 from torchrl_pomdp.envs.repair import RepairModel
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout, check_finite
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
@@ -96,7 +96,9 @@ class NeverRepairCost(ClosedFormCost):
         chain = check_instance("model", model, RepairModel).chain.double()
         system = torch.eye(model.num_levels, dtype=chain.dtype, device=chain.device) - model.discount * chain
         # Discounted cost of one location that starts at each level.
-        self.level_costs = tuple(torch.linalg.solve(system, model.costs.double()).tolist())
+        level_costs = torch.linalg.solve(system, model.costs.double()).to(model.dtype)
+        check_finite(f"costs of the model for ever must be finite in {model.dtype}", level_costs)
+        self.level_costs = tuple(level_costs.tolist())
 
     def costs(self, y: TensorDictBase) -> Tensor:
         """Costs ``[*B]``."""

@@ -105,7 +105,7 @@ def _gaps(q_factors: Tensor, label: Tensor) -> Tensor:
     """Q-factors ``[N, U]`` minus their smallest, zero where illegal; the labels ``[N]`` must be legal."""
     illegal = q_factors == torch.inf
     gaps = (q_factors - q_factors.amin(-1, keepdim=True)).masked_fill(illegal, 0.0)
-    if not bool(torch.isfinite(gaps).all()) or bool(illegal.all(-1).any()):
+    if not bool(torch.isfinite(gaps.sum(-1)).all()) or bool(illegal.all(-1).any()):
         raise ValueError("q_factors must be finite, or +inf where a control is illegal, and not overflow; got others")
     if not bool(((label >= 0) & (label < q_factors.shape[-1])).all()) or bool(illegal.gather(-1, label.unsqueeze(-1)).any()):
         raise ValueError("action must be a legal control, one with a finite Q-factor, got another")

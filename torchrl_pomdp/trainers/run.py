@@ -17,7 +17,7 @@ from torchrl.record import CSVLogger
 from torchrl_pomdp import __version__
 from torchrl_pomdp.checks import check_callable, check_choice, check_flag, check_instance, check_integer, check_path
 from torchrl_pomdp.collectors import OnLabels
-from torchrl_pomdp.config import EVALUATION_SEED, PolicyIterationConfig
+from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
 from torchrl_pomdp.envs import PRESETS, Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import DamagedFileError, write_json
@@ -82,8 +82,8 @@ class TrainingRun:
         check_choice("algorithm", self.algorithm, ALGORITHMS)
         check_choice("base", self.base, BASE_POLICIES)
         check_instance("config", self.config, PolicyIterationConfig)
-        check_integer("states", self.states, 1, 10**9)
-        check_integer("online_states", self.online_states, 0, 10**9)
+        check_integer("states", self.states, 1, MAX_STATES)
+        check_integer("online_states", self.online_states, 0, MAX_STATES)
         check_integer("online_trajectories", self.online_trajectories, 1, 10**6)
 
     def make_problem(self, device: torch.device | str = "cpu") -> Problem:

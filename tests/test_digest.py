@@ -1,0 +1,116 @@
+"""Digests: equal for equal content, different as soon as a number differs, the same in every process."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_pomdp.envs import CalibratedStart, grid, line, make_problem
+from torchrl_pomdp.identity import digest, identity
+from torchrl_pomdp.modules import FlatEncoder, GreedyRepair, PolicyNetwork, RolloutPolicy
+
+
+def adds(n):
+    return lambda y: y + n
+
+
+def default(y, n=1):
+    return y + n
+
+
+def other_default(y, n=2):
+    return y + n
+
+
+def network(seed, hidden=(4,)):
+    model = make_problem("line3").model
+    return PolicyNetwork(FlatEncoder(model), 3, hidden, generator=torch.Generator().manual_seed(seed))
+
+
+# Pairs of makers of what is equal to itself and differs from the other one.
+PAIRS = {
+    "integers": (lambda: 1, lambda: 2),
+    "integer and number": (lambda: 1, lambda: 1.0),
+    "flag and integer": (lambda: True, lambda: 1),
+    "text and bytes": (lambda: "1", lambda: b"1"),
+    "nothing and text": (lambda: None, lambda: "None"),
+    "lists": (lambda: [1, 2], lambda: [2, 1]),
+    "list and tuple": (lambda: [1, 2], lambda: (1, 2)),
+    "nested": (lambda: [[1], [2]], lambda: [[1, 2], []]),
+    "texts side by side": (lambda: ["ab", "c"], lambda: ["a", "bc"]),
+    "mappings": (lambda: {"a": 1, "b": 2}, lambda: {"a": 2, "b": 1}),
+    "sets": (lambda: {1, 2}, lambda: {1, 3}),
+    "tensors": (lambda: torch.arange(4), lambda: torch.arange(1, 5)),
+    "types": (lambda: torch.ones(2), lambda: torch.ones(2).double()),
+    "shapes": (lambda: torch.ones(2, 3), lambda: torch.ones(3, 2)),
+    "one ulp": (lambda: torch.ones(1), lambda: torch.ones(1) + 2**-23),
+    "empty": (lambda: torch.zeros(0), lambda: torch.zeros(0, 1)),
+    "tensordicts": (lambda: TensorDict({"a": torch.ones(2)}, [2]), lambda: TensorDict({"a": torch.ones(2)}, [])),
+    "closures": (lambda: adds(1), lambda: adds(2)),
+    "defaults": (lambda: default, lambda: other_default),
+    "partials": (lambda: functools.partial(default, n=1), lambda: functools.partial(default, n=2)),
+    "generators": (lambda: torch.Generator().manual_seed(1), lambda: torch.Generator().manual_seed(2)),
+    "graphs": (lambda: line(4), lambda: grid(4, 1)),
+    "models": (lambda: make_problem("line3").model, lambda: make_problem("line3", partitioned=False).model),
+    "problems": (lambda: make_problem("line3"), lambda: make_problem("linear20")),
+    "policies": (lambda: GreedyRepair(make_problem("line3").model), lambda: GreedyRepair(make_problem("line3").model, 0.1)),
+    "starts": (
+        lambda: CalibratedStart(make_problem("line3").model),
+        lambda: CalibratedStart(make_problem("line3").model, observe_start=False),
+    ),
+    "weights": (lambda: network(0), lambda: network(1)),
+    "layers": (lambda: network(0), lambda: network(0, (4, 4))),
+    "methods": (lambda: network(0).forward, lambda: network(1).forward),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_equal_content_has_equal_digests_and_other_content_others(name):
+    one, other = PAIRS[name]
+    assert digest(one()) == digest(one())
+    assert digest(other()) == digest(other())
+    assert digest(one()) != digest(other())
+    assert digest([one()]) != digest([other()])
+    assert identity(one()).split()[1] == digest(one())
+
+
+def test_what_says_nothing_of_the_content_does_not_matter():
+    assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
+    assert digest(torch.arange(6).view(2, 3).T.contiguous()) == digest(torch.arange(6).view(2, 3).T)
+    assert digest(torch.ones(2, requires_grad=True)) == digest(torch.ones(2))
+    problem = make_problem("line3")
+    policy = RolloutPolicy(problem.model, network(0), trajectories=1)
+    before = digest(policy)
+    policy(problem.start(torch.arange(2)))
+    assert digest(policy) == before == digest(copy.deepcopy(policy)) == digest(policy.eval())
+
+
+def test_content_that_leads_back_to_itself_has_a_digest():
+    loop = [1]
+    loop.append(loop)
+    other = [2]
+    other.append(other)
+    assert digest(loop) == digest(loop) != digest(other)
+
+
+NAMES = [name for name in PAIRS if name not in ("generators",)]
+SCRIPT = """
+import sys
+sys.path.insert(0, {here!r})
+from test_digest import NAMES, PAIRS, digest
+print(*(digest(make()) for name in NAMES for make in PAIRS[name]))
+"""
+
+
+def test_digests_do_not_depend_on_the_process():
+    script = SCRIPT.format(here=os.path.dirname(__file__))
+    env = os.environ | {"PYTHONHASHSEED": "123", "OMP_NUM_THREADS": "1"}
+    out = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, check=True).stdout
+    assert out.split() == [digest(make()) for name in NAMES for make in PAIRS[name]]
