@@ -112,8 +112,8 @@ def test_evaluate_by_name_and_online(policy, capsys):
     ("args", "message"),
     [
         ("train nosuch", "problem must be one of grid5x4, grid6x6, line3, linear20, two_robots20, got 'nosuch'"),
-        ("train line3 --states 0", "states must be an integer in"),
-        ("train line3 --online-states -5", "online_states must be an integer in"),
+        ("train line3 --states 0", "states must be at least 1, got 0"),
+        ("train line3 --online-states -5", "online_states must be at least 0, got -5"),
         ("train line3 --iterations 0", "iterations must be at least 1, got 0"),
         ("train line3 --max-steps 100000000000", "max_steps must be"),
         ("train line3 --visits-per-label inf", "visits_per_label must be in (0, 1000], got inf"),

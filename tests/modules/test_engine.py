@@ -76,8 +76,8 @@ def test_labels_can_be_trained_on(linear20):
 def test_compiled_and_eager_agree(line3):
     """All that a step may hold: the stratified observations of several trajectories, and a rule that reads the part."""
     model, y = line3.model, line3.start(torch.arange(30))
-    rule = {"truncation": OnEntering((3, 4, 5)) | AfterSteps(40), "terminal_cost": NeverRepairCost(model)}
-    options = {"trajectories": 3, "chunk_rows": 100, **rule}
+    rule = {"truncation": OnEntering((3, 4, 5)) | AfterSteps(12), "terminal_cost": NeverRepairCost(model)}
+    options = {"trajectories": 3, **rule}
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="compile=True")
         fast = RolloutPolicy(model, GreedyRepair(model), compile=True, **options).q_factors(y)

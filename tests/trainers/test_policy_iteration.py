@@ -148,7 +148,7 @@ def test_all_six_parts_can_have_values(line3):
 
 
 def test_truncation_saves_simulated_steps(linear20):
-    config = replace(TINY, samples_per_part=30, value_samples=30, max_steps=400)
+    config = replace(TINY, samples_per_part=30, value_samples=30, max_steps=150, validation_states=10, visits_per_label=0.05)
     steps = []
     for recipe in (papi_nt, papi_t):
         (iteration,) = run(linear20, config, recipe)
