@@ -6,6 +6,8 @@ the size of the batch and on the column's place in it; elementwise operations le
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from torch import Tensor
 
 __all__ = ["multiply_first", "sum_first"]
@@ -25,12 +27,7 @@ def sum_first(terms: Tensor) -> Tensor:
         >>> sum_first(torch.arange(10.0).view(5, 2)).tolist()
         [20.0, 25.0]
     """
-    count = terms.shape[0]
-    while count > 1:
-        half = (count + 1) // 2
-        terms[: count - half].add_(terms[half:count])
-        count = half
-    return terms[0]
+    return _by_halves(terms, Tensor.add_)
 
 
 def multiply_first(factors: Tensor) -> Tensor:
@@ -47,9 +44,13 @@ def multiply_first(factors: Tensor) -> Tensor:
         >>> multiply_first(torch.arange(1.0, 7.0).view(3, 2)).tolist()
         [15.0, 48.0]
     """
-    count = factors.shape[0]
+    return _by_halves(factors, Tensor.mul_)
+
+
+def _by_halves(values: Tensor, join: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    count = values.shape[0]
     while count > 1:
         half = (count + 1) // 2
-        factors[: count - half].mul_(factors[half:count])
+        join(values[: count - half], values[half:count])
         count = half
-    return factors[0]
+    return values[0]
