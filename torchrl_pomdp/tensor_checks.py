@@ -53,7 +53,8 @@ def check_device(name: str, value: Any) -> torch.device:
         raise TypeError(f"{name} must be a device such as cpu or cuda:0, got {shown(value)}")
     try:
         device = torch.device(value)
-        torch.empty(0, device=device)
+        # A tensor without numbers, as on the device meta, has no first one.
+        torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         raise ValueError(f"{name} must be a device of this machine such as cpu or cuda:0, got {shown(str(value))}") from error
     return device

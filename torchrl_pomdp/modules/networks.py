@@ -3,7 +3,7 @@ r"""Policy and value networks, :math:`\hat\mu(y,r)` and :math:`\hat J(y,r)` (pap
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, cast
 
@@ -42,6 +42,15 @@ class LocalNetwork(TensorDictModuleBase):
         check_instance("generator", generator, torch.Generator)
         self.encoder = encoder
         self.network = _relu_network([encoder.num_features, *sizes], encoder.dtype, generator)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> LocalNetwork:
+        """Refuse another type than the encoder's, which is the model's: ``double``, ``half`` and the like."""
+        dtype = fn(torch.ones(1, dtype=self.encoder.dtype)).dtype
+        if dtype != self.encoder.dtype:
+            raise ValueError(
+                f"a network stays in the type {self.encoder.dtype} of its model; build the model with dtype={dtype}"
+            )
+        return super()._apply(fn, recurse)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the ``out_keys`` for feature states ``[*B]``."""
