@@ -142,6 +142,6 @@ def test_a_network_stays_in_its_models_type(linear20):
     y = linear20.model.with_features(linear20.start(torch.arange(3)))
     logits = policy(y.copy())["logits"]
     for convert in (policy.double, policy.half, PartitionedPolicy([policy] * 6).bfloat16):
-        with pytest.raises(ValueError, match=r"stays in its model's type torch\.float32"):
+        with pytest.raises(ValueError, match=r"stays in the type torch\.float32"):
             convert()
     assert torch.equal(policy.to("cpu", torch.float32)(y.copy())["logits"], logits), "nothing was converted"
