@@ -6,13 +6,14 @@ interpreter, so that threads with a chunk each run side by side.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
 
-__all__ = ["blocks", "map_threads"]
+__all__ = ["blocks", "kept_threads", "map_threads"]
 
 # Trajectories that are made at once, in chunks of the rollout: enough to keep its chunk full nearly all the time.
 _CHUNKS_PER_BLOCK = 8
@@ -58,9 +59,23 @@ def map_threads(function: Callable[[_Item], _Result], items: Sequence[_Item], th
         with torch.no_grad():
             return function(item)
 
+    with kept_threads(), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        return list(pool.map(run, items))
+
+
+@contextmanager
+def kept_threads(threads: int | None = None) -> Iterator[None]:
+    """Leave the number of threads of one operation as it was afterwards; meanwhile it is ``threads``, if that is given.
+
+    Examples:
+        >>> with kept_threads(1):
+        ...     torch.get_num_threads()
+        1
+    """
     before = torch.get_num_threads()
     try:
-        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(run, items))
+        if threads is not None:
+            torch.set_num_threads(threads)
+        yield
     finally:
         torch.set_num_threads(before)

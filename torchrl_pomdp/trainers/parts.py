@@ -17,6 +17,7 @@ from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
 from torchrl_pomdp.checks import check_flag, check_instance, check_seed, check_text
 from torchrl_pomdp.config import PolicyIterationConfig
+from torchrl_pomdp.modules.threads import kept_threads
 from torchrl_pomdp.progress import progress_bar
 
 __all__ = ["PartRecord", "train_part"]
@@ -108,7 +109,9 @@ def train_part(
     trainer.register_op("batch_process", partial(_store, buffer))
     trainer.register_op("process_optim_batch", lambda batch: buffer.sample())
     begin = time.perf_counter()
-    trainer.train()
+    # Products of a few rows are slower with several threads than with one, and sums of gradients would depend on their number.
+    with kept_threads(1):
+        trainer.train()
     return time.perf_counter() - begin, stepper.final()
 
 
