@@ -78,7 +78,7 @@ def test_labels_do_not_depend_on_batch_order_or_chunks(linear20):
         for leaves in ("control", "observation"):
 
             def q(y, chunk_rows=8192, base=base, leaves=leaves):
-                options = {"max_steps": 60, "terminal_cost": NeverRepairCost(model)}
+                options = {"max_steps": 25, "terminal_cost": NeverRepairCost(model)}
                 policy = RolloutPolicy(model, base, trajectories=3, leaves=leaves, chunk_rows=chunk_rows, **options)
                 return policy.q_factors(y)
 

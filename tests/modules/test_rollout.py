@@ -81,7 +81,7 @@ def test_realised_costs_with_independent_noise_make_rollout_worse_than_greedy(li
     """Why the stage cost is the expectation and the controls share their noise: without both, rollout is ruined."""
     model, greedy = linear20.model, GreedyRepair(linear20.model)
     naive = _NaiveRollout(model, greedy, trajectories=10)
-    options = {"num_states": 10, "max_steps": 120, "terminal_cost": NeverRepairCost(model)}
+    options = {"num_states": 8, "max_steps": 100, "terminal_cost": NeverRepairCost(model)}
     baseline = discounted_costs(model, greedy, linear20.start, **options)
     comparison = compare(discounted_costs(model, naive, linear20.start, **options), baseline)
     assert comparison.difference.interval[0] > 0

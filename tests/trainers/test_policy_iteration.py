@@ -77,9 +77,9 @@ def weights(policy):
 
 
 def test_policy_iteration_improves_greedy_on_the_line_of_3(line3):
-    config = replace(TINY, samples_per_part=300, trajectories=6, epochs=40, hidden=(64, 32), max_steps=400)
+    config = replace(TINY, samples_per_part=250, trajectories=5, epochs=40, hidden=(64, 32), max_steps=400)
     config = replace(config, visits_per_label=0.2)
-    iteration = papi_nt(line3, replace(config, validation_states=2000), GreedyRepair(line3.model))
+    iteration = papi_nt(line3, replace(config, validation_states=1500), GreedyRepair(line3.model))
     (only,) = iteration
     assert only.accepted
     assert iteration.best is only.policy
