@@ -7,6 +7,8 @@ import functools
 import os
 import subprocess
 import sys
+import threading
+from collections import deque
 
 import pytest
 import torch
@@ -114,3 +116,22 @@ def test_digests_do_not_depend_on_the_process():
     env = os.environ | {"PYTHONHASHSEED": "123", "OMP_NUM_THREADS": "1"}
     out = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, check=True).stdout
     assert out.split() == [digest(make()) for name in NAMES for make in PAIRS[name]]
+
+
+WEIGHTS = [1.0, 2.0]
+
+
+def weighted(y):
+    return y * WEIGHTS[0]
+
+
+def test_what_pickling_alone_tells_and_what_a_function_reads_is_told(monkeypatch):
+    numpy = pytest.importorskip("numpy")
+    values = [numpy.arange(3), numpy.arange(4), range(3), range(4), deque([1]), deque([2]), bytearray(b"a"), bytearray(b"b")]
+    assert len({digest(value) for value in values}) == len(values)
+    assert digest(numpy.arange(3)) == digest(numpy.arange(3))
+    before = digest(weighted)
+    monkeypatch.setitem(globals(), "WEIGHTS", [3.0, 2.0])
+    assert digest(weighted) != before
+    with pytest.raises(TypeError, match="cannot be told"):
+        digest(threading.Lock())

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_pomdp.envs import BeliefEnv, FixedBelief, make_problem, tiger
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief, RandomState, RepairModel, damage_chain, line, make_problem, tiger
 from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout, ZeroCost
 from torchrl_pomdp.modules.scenarios import Scenarios
 
@@ -126,3 +126,10 @@ def test_moving_to_another_device_is_refused():
     assert env.to("cpu") is env
     with pytest.raises(ValueError, match="build the model on meta"):
         env.to("meta")
+
+
+def test_rewards_that_are_no_numbers_are_refused():
+    model = RepairModel(line(20), damage_chain((0.0, 0.9)), (0.0, 1.0, 3e37), 0.95)
+    env = BeliefEnv(model, RandomState(model), batch_size=(40,), seed=0)
+    with pytest.raises(ValueError, match="expected_cost of the model must be finite, got inf"):
+        env.rollout(5)

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.objectives.value import GAE
 
 from torchrl_pomdp.collectors import PolicyEvaluation, RolloutImprovement
-from torchrl_pomdp.envs import BeliefEnv, CalibratedStart, Graph, grid, line, symmetries
+from torchrl_pomdp.envs import BeliefEnv, CalibratedStart, Graph, RepairModel, damage_chain, grid, line, symmetries
 from torchrl_pomdp.modules import (
     FlatEncoder,
     GreedyRepair,
@@ -290,3 +290,12 @@ def test_policies_that_are_replaced_are_used(line3):
     rows = y["partition"] == 3
     assert policy(y.copy())["action"][rows].equal(greedy(y[rows])["action"])
     assert policy(y.copy())["action"][~rows].equal(second(y[~rows])["action"])
+
+
+@pytest.mark.parametrize("columns", [[0.0, 1e-6, 1.0, 2.0], [0.0, 1e-3, 100.0, 1000.0], [0.0, 4e-6, 8e-6, 1.0]])
+def test_near_locations_are_not_taken_for_one(columns):
+    table = [[-1, 1], [0, 2], [1, 3], [2, -1]]
+    graph = Graph.from_slots("pipe", table, ("left", "right"), columns, [0.0] * 4)
+    model = RepairModel(graph, damage_chain((0.0, 0.3)), (0.0, 1.0, 5.0), 0.95)
+    seen = RelativeEncoder(model).columns.view(4, 4, 3)[..., 0]
+    assert all(len(row.unique()) == 4 for row in seen)

@@ -1,0 +1,40 @@
+"""Files: one archive from the first byte to the last, and records that belong to whoever was first."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+import torch
+
+from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, tensor_bytes
+
+
+def test_an_archive_before_or_behind_another_one_is_refused(tmp_path):
+    first, second = (tensor_bytes({"x": torch.full((8,), value)}) for value in (1.0, 2.0))
+    for number, content in enumerate((first + second, b"PK" + first, first + b"\0", second[:40] + first)):
+        path = tmp_path / f"{number}.pt"
+        path.write_bytes(content)
+        with pytest.raises(DamagedFileError, match=str(path)):
+            load_tensors(path)
+
+
+def test_a_record_is_claimed_by_one_of_many(tmp_path):
+    for attempt in range(10):
+        path, refused = tmp_path / str(attempt) / "config.json", []
+        barrier = threading.Barrier(4)
+
+        def compete(seed, path=path, refused=refused, barrier=barrier):
+            barrier.wait()
+            try:
+                claim(path, {"seed": seed})
+            except ValueError:
+                refused.append(seed)
+
+        threads = [threading.Thread(target=compete, args=(seed,)) for seed in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(refused) == 3
+        assert [file.name for file in path.parent.iterdir()] == ["config.json"]
