@@ -78,14 +78,8 @@ def train_part(
         TypeError: if an argument is of the wrong kind.
         ValueError: if there are no states, or a loss is not finite.
     """
-    check_instance("batch", batch, TensorDictBase)
-    check_instance("loss", loss, LossModule)
-    check_instance("config", config, PolicyIterationConfig)
+    _check(batch, loss, config, logger)
     seed, name, progress = check_seed("seed", seed), check_text("name", name), check_flag("progress", progress)
-    if logger is not None:
-        check_instance("logger", logger, Logger)
-    if batch.ndim != 1 or batch.batch_size[0] == 0:
-        raise ValueError(f"batch must hold labelled states [N], at least one, got batch {tuple(batch.batch_size)}")
     size = batch.batch_size.numel()
     steps = max(config.least_steps, config.epochs * size // config.batch_size)
     optimizer = torch.optim.RMSprop(loss.parameters(), config.learning_rate)
@@ -113,6 +107,16 @@ def train_part(
     with kept_threads(1):
         trainer.train()
     return time.perf_counter() - begin, stepper.final()
+
+
+def _check(batch: TensorDictBase, loss: LossModule, config: PolicyIterationConfig, logger: Logger | None) -> None:
+    check_instance("batch", batch, TensorDictBase)
+    check_instance("loss", loss, LossModule)
+    check_instance("config", config, PolicyIterationConfig)
+    if logger is not None:
+        check_instance("logger", logger, Logger)
+    if batch.ndim != 1 or batch.batch_size[0] == 0:
+        raise ValueError(f"batch must hold labelled states [N], at least one, got batch {tuple(batch.batch_size)}")
 
 
 class _Labelled:
