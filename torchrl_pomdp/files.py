@@ -184,7 +184,6 @@ def claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
 
 def _write_new(path: Path, content: bytes) -> bool:
     """Write a file that nobody else has written meanwhile, whole or not at all; False where somebody has."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
     write_bytes(temporary, content)
     try:
@@ -195,6 +194,13 @@ def _write_new(path: Path, content: bytes) -> bool:
     finally:
         temporary.unlink(missing_ok=True)
     return True
+
+
+def check_claimed(path: Path, cause: BaseException | None = None) -> None:
+    """Raise a ``FileNotFoundError`` if the record that :func:`claim` has written is gone."""
+    if not path.is_file():
+        what = f"run folder {path.parent} was deleted or moved while the run went on"
+        raise FileNotFoundError(f"{what}: delete what is left of it and start the run again") from cause
 
 
 def save_tensors(path: str | PathLike[str], content: dict[str, Any]) -> None:

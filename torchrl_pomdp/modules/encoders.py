@@ -62,8 +62,8 @@ _SAME = 1e-5
 _MOST_FEATURES = 1 << 19
 
 
-def transformed(tensor: Tensor) -> bool:
-    """Whether a function transform such as ``vmap`` runs, under which the numbers of ``tensor`` cannot decide what is done."""
+def transformed() -> bool:
+    """Whether a function transform such as ``vmap`` runs, under which the numbers of a tensor cannot decide what is done."""
     return torch._C._functorch.peek_interpreter_stack() is not None
 
 
@@ -186,7 +186,7 @@ class RelativeEncoder(Encoder):
         the weights that matter to it, and no window is ever made.
         """
         belief, location = y.get("belief"), y.get("location")
-        if rows.device.type != "cpu" or belief.requires_grad or transformed(belief):
+        if rows.device.type != "cpu" or belief.requires_grad or transformed():
             return super().first_layers(y, rows, layers, counts)
         numbers = self.numbers(belief)
         return [

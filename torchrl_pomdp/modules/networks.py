@@ -179,7 +179,7 @@ def evaluate_networks(
 
 
 def _check_finite(name: str, values: Tensor) -> None:
-    if not transformed(values) and not bool(torch.isfinite(values).all()):
+    if not transformed() and not bool(torch.isfinite(values).all()):
         wrong = values[~torch.isfinite(values)][0].item()
         raise ValueError(
             f"{name} of a network must be finite, got {wrong}: a weight is no number, or the state has no legal control"

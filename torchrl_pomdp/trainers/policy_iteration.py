@@ -32,7 +32,7 @@ from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.envs.symmetry import symmetries
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.files import claim
+from torchrl_pomdp.files import check_claimed, claim
 from torchrl_pomdp.identity import digest, identity
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import (
@@ -265,7 +265,7 @@ class PolicyIteration:
         if path is not None and cache is not None:
             states = {str(part): network.state_dict() for part, network in networks.items()}
             content = {"networks": states, "records": json.dumps({key: r.to_dict() for key, r in records.items()})}
-            self._check_folder()
+            check_claimed(path.parents[1] / _RECORD)
             keep(path, f"{self._owner} {name}", content)
             shutil.rmtree(cache, ignore_errors=True)
         return records
@@ -273,13 +273,6 @@ class PolicyIteration:
     def _path(self, name: str) -> Path | None:
         """File of a step's networks; None where nothing is kept."""
         return None if self.folder is None else self.folder / f"{name}.pt"
-
-    def _check_folder(self) -> None:
-        """Raise if the folder is no longer the one that this run has claimed."""
-        if self.folder is not None and not (self.folder / _RECORD).is_file():
-            raise FileNotFoundError(
-                f"run folder {self.folder} was deleted or moved while the run went on: delete what is left and start again"
-            )
 
     def _images(self, labelled: dict[int, Any]) -> dict[int, TensorDictBase]:
         """For every part, the labelled states and mirror images of labelled states that lie in it."""

@@ -20,7 +20,7 @@ from torchrl_pomdp.collectors import OnLabels
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
 from torchrl_pomdp.envs import PRESETS, Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.files import DamagedFileError, write_json
+from torchrl_pomdp.files import DamagedFileError, check_claimed, write_json
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import NeverRepairCost, PartitionedValue, Policy
@@ -225,9 +225,7 @@ class _Execution:
 
     def check_folder(self, cause: BaseException | None = None) -> None:
         """Raise if the folder is no longer the one that the run has opened."""
-        if not (self.folder / "config.json").is_file():
-            what = f"run folder {self.folder} was deleted or moved while the run went on"
-            raise FileNotFoundError(f"{what}: delete what is left of it and start the run again") from cause
+        check_claimed(self.folder / "config.json", cause)
 
     @cached_property
     def _baseline(self) -> Tensor:
