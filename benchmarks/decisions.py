@@ -9,7 +9,8 @@ import torch
 
 from benchmarks.harness import Table, threads
 from benchmarks.setting import Counting, linear20, networks, states
-from torchrl_pomdp.modules import GreedyRepair, RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.modules import RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.modules.repair import GreedyRepair
 
 
 def decision(table: Table) -> None:

@@ -15,7 +15,8 @@ import torch
 from benchmarks.harness import Table, seconds, threads
 from benchmarks.setting import Counting, line_problem, linear20, network_flops, networks
 from torchrl_pomdp.envs import BeliefEnv
-from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout, ZeroCost
+from torchrl_pomdp.modules import TruncatedRollout, ZeroCost
+from torchrl_pomdp.modules.repair import GreedyRepair
 
 
 def greedy(table: Table) -> None:
@@ -140,7 +141,8 @@ _MEMORY = """
 import sys, torch
 from pathlib import Path
 from benchmarks.setting import line_problem
-from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout, ZeroCost
+from torchrl_pomdp.modules import TruncatedRollout, ZeroCost
+from torchrl_pomdp.modules.repair import GreedyRepair
 torch.set_num_threads(1)
 # The peak of this program alone; what `resource` tells includes that of the one which has started it.
 peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])

@@ -8,9 +8,11 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_pomdp.collectors import PartSampler, StateMemory, training_states
-from torchrl_pomdp.envs import CalibratedStart, Problem, RepairModel, RepairPartition, damage_chain, line, make_problem
-from torchrl_pomdp.modules import GreedyRepair, PartitionedPolicy
+from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, RepairPartition, damage_chain, line
+from torchrl_pomdp.modules import PartitionedPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.objectives import ClassificationLoss
+from torchrl_pomdp.problems import Problem, make_problem
 from torchrl_pomdp.trainers import PolicyIterationConfig, make_networks
 
 

@@ -11,9 +11,10 @@ import torch
 
 from benchmarks.harness import Table, threads
 from benchmarks.setting import linear20, networks
-from torchrl_pomdp.envs import RepairModel
-from torchrl_pomdp.modules import GreedyRepair, PartitionedPolicy, TruncatedRollout
+from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.modules import PartitionedPolicy, TruncatedRollout
 from torchrl_pomdp.modules import rollout as rollout_module
+from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.modules.scenarios import Scenarios
 
 _PARTS = {

@@ -7,8 +7,8 @@ from itertools import product
 import torch
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import RepairModel, UniformStart, damage_chain, line
-from torchrl_pomdp.envs.belief import take_rows
+from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, line
+from torchrl_pomdp.envs.rows import take_rows
 
 COSTS = (0.0, 0.1, 1.0, 10.0, 100.0)
 

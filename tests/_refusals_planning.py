@@ -20,7 +20,9 @@ from _hostile import (
     generators,
     integers,
     keys,
+    mappings,
     no_states,
+    not_callable,
     numbers,
     objects,
     probabilities,
@@ -62,9 +64,12 @@ from _valid import (
 )
 from tensordict import TensorDictBase
 
-from torchrl_pomdp import envs, modules
-from torchrl_pomdp.envs import Graph, Mixture, RepairModel, SinglePart, TabularModel
-from torchrl_pomdp.modules import FlatEncoder, GreedyRepair, NeverRepairCost, OnEntering, RolloutPolicy, ZeroCost
+from torchrl_pomdp import envs, modules, problems
+from torchrl_pomdp.envs import Mixture, SinglePart, TabularModel, repair
+from torchrl_pomdp.envs.repair import Graph, RepairModel
+from torchrl_pomdp.modules import FlatEncoder, OnEntering, RolloutPolicy, ZeroCost
+from torchrl_pomdp.modules import repair as repair_modules
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
 
 __all__ = ["ENVS", "MODULES"]
 
@@ -85,13 +90,13 @@ HEAR = torch.full((3, 2, 4), 0.25)
 
 def play(of):
     """Use a model."""
-    RolloutPolicy(of, GreedyRepair(of), trajectories=1, terminal_cost=ZeroCost())(envs.CalibratedStart(of)(KEYS))
+    RolloutPolicy(of, GreedyRepair(of), trajectories=1, terminal_cost=ZeroCost())(repair.CalibratedStart(of)(KEYS))
 
 
 ENVS = {
-    "envs.line": lambda _: case(envs.line, num_locations=(3, integers(1))),
-    "envs.grid": lambda _: case(envs.grid, width=(3, integers(1)), height=(2, integers(1))),
-    "envs.Graph.from_slots": lambda _: case(
+    "envs.repair.line": lambda _: case(repair.line, num_locations=(3, integers(1))),
+    "envs.repair.grid": lambda _: case(repair.grid, width=(3, integers(1)), height=(2, integers(1))),
+    "envs.repair.Graph.from_slots": lambda _: case(
         Graph.from_slots,
         name=("pipe", texts()),
         neighbours=(SLOTS, WRONG_SLOTS),
@@ -99,7 +104,7 @@ ENVS = {
         columns=([0, 1, 2], [*COORDINATES, *values((0, 0, 1))]),
         rows=([0, 0, 0], COORDINATES),
     ),
-    "envs.Graph.from_edges": lambda _: case(
+    "envs.repair.Graph.from_edges": lambda _: case(
         Graph.from_edges,
         name=("pipe", texts()),
         num_locations=(3, integers(1)),
@@ -107,13 +112,13 @@ ENVS = {
         columns=([0, 1, 2], [*COORDINATES, *values((0, 0, 1))]),
         rows=([0, 0, 0], COORDINATES),
     ),
-    "envs.damage_chain": lambda _: case(
-        envs.damage_chain,
+    "envs.repair.damage_chain": lambda _: case(
+        repair.damage_chain,
         degradation=((0.0, 0.3), [*sequences((0.0, 0.3), NAN, INF, -1e-9, 1.1, "0.5", None, [0.1], 1j, 10**400), *values(0.5)]),
     ),
-    "envs.RepairModel": lambda _: case(
+    "envs.repair.RepairModel": lambda _: case(
         RepairModel, play,
-        graph=(envs.line(3), objects(Graph)),
+        graph=(repair.line(3), objects(Graph)),
         chain=(CHAIN, probabilities(CHAIN)),
         costs=(COSTS, tensors(COSTS, -1.0) + values((0.0, 1e39), (0.0, 1e300), ("0", "1"), (0.0, None), (0.0, 10**400))),
         discount=(0.9, numbers("(0, 1)")),
@@ -139,7 +144,7 @@ ENVS = {
         dtype=(torch.float32, dtypes()),
         device=("cpu", devices()),
     ),
-    "envs.tiger": lambda _: case(envs.tiger, discount=(0.9, numbers("(0, 1)")), device=("cpu", devices())),
+    "problems.tiger": lambda _: case(problems.tiger, discount=(0.9, numbers("(0, 1)")), name=("tiger", texts()), device=("cpu", devices())),
     "envs.BeliefEnv": lambda _: case(
         envs.BeliefEnv, lambda made: made.rollout(2),
         model=belief_model(),
@@ -155,31 +160,31 @@ ENVS = {
     "envs.BeliefEnv.step": lambda _: on_tensordict(
         env().step, (greedy()(state()), [Hostile("no action", state(), names=("action",)), *wrong_actions(state())])
     ),
-    "envs.UniformStart": lambda _: case(
-        envs.UniformStart,
+    "envs.repair.UniformStart": lambda _: case(
+        repair.UniformStart,
         model=repair_model(),
         robots=((0,), sequences((0,), -1, 3, HUGE, 1.5, True, "0", None, NAN, [0], free=False)),
         observe_start=(True, flags()),
     ),
-    "envs.UniformStart.__call__": lambda _: on_keys(envs.UniformStart(model())),
-    "envs.CalibratedStart": lambda _: case(
-        envs.CalibratedStart,
+    "envs.repair.UniformStart.__call__": lambda _: on_keys(repair.UniformStart(model())),
+    "envs.repair.CalibratedStart": lambda _: case(
+        repair.CalibratedStart,
         model=repair_model(),
         damaged_fraction=(0.7, numbers("(0, 1]")),
         observe_start=(True, flags()),
     ),
-    "envs.CalibratedStart.__call__": lambda _: on_keys(envs.CalibratedStart(model())),
-    "envs.RandomState": lambda _: case(
-        envs.RandomState, lambda made: made(KEYS),
+    "envs.repair.CalibratedStart.__call__": lambda _: on_keys(repair.CalibratedStart(model())),
+    "envs.repair.RandomState": lambda _: case(
+        repair.RandomState, lambda made: made(KEYS),
         model=repair_model(),
         fractions=((0.2, 1.0), sequences((0.2, 1.0), 0.1, -0.1, 1.1, NAN, INF, "1", None, [1.0], 10**400, free=False)),
         max_age=(4, integers(0)),
     ),
-    "envs.RandomState.__call__": lambda _: on_keys(envs.RandomState(model())),
+    "envs.repair.RandomState.__call__": lambda _: on_keys(repair.RandomState(model())),
     "envs.InPart": lambda _: case(
         envs.InPart, lambda made: made(KEYS),
-        model=(model(), objects(RepairModel, envs.tiger(), two_robots())),
-        proposal=(envs.RandomState(model()), generators(start())),
+        model=(model(), objects(RepairModel, problems.tiger().model, two_robots())),
+        proposal=(repair.RandomState(model()), generators(start())),
         part=(4, integers(0, 5)),
         max_tries=(500, integers(1)),
     ),
@@ -197,46 +202,56 @@ ENVS = {
     "envs.Mixture.__call__": lambda _: on_keys(Mixture([start()], [1.0])),
     "envs.FixedBelief": lambda _: case(envs.FixedBelief, belief=(BELIEF, probabilities(BELIEF, free=True))),
     "envs.FixedBelief.__call__": lambda _: on_keys(envs.FixedBelief(BELIEF)),
-    "envs.RepairPartition": lambda _: case(
-        envs.RepairPartition,
-        graph=(envs.line(3), objects(Graph)),
+    "envs.repair.RepairPartition": lambda _: case(
+        repair.RepairPartition,
+        graph=(repair.line(3), objects(Graph)),
         costs=(COSTS, tensors(COSTS, -1.0, free=True)),
         damage_threshold=(0.0, numbers("[0, 1)")),
         device=("cpu", devices()),
     ),
-    "envs.RepairPartition.forward": lambda _: case(model().partition, y=(state(), no_states(state(), "belief", "location"))),
+    "envs.repair.RepairPartition.forward": lambda _: case(model().partition, y=(state(), no_states(state(), "belief", "location"))),
     "envs.SinglePart": lambda _: case(SinglePart(), y=(state(), no_states(state()))),
-    "envs.Problem": lambda _: case(
-        envs.Problem,
-        name=("line3", texts()),
+    "problems.Problem": lambda _: case(
+        problems.Problem,
         model=belief_model(),
         start=(start(), sequences((), empty=False)),
+        name=("line3", texts()),
         training=(problem().training, sequences(problem().training, None, 3, "x", free=False)),
-        partitioned=(True, flags()),
+        base_policies=({"greedy": greedy()}, [*mappings(), *values({}, {"greedy": 3}, {3: greedy()}, {"": greedy()})]),
+        pessimistic_cost=(problem().pessimistic_cost, objects(greedy(), 3.0)),
+        symmetries=(problem().symmetries, values((), (3,), 3, "x")),
+        encoder=(problem().encoder, not_callable()),
+        spec=(None, mappings()),
     ),
-    "envs.make_problem": lambda _: case(
-        envs.make_problem, name=("line3", choices()), partitioned=(True, flags()), device=("cpu", devices())
+    "problems.Problem.unpartitioned": lambda _: case(problem().unpartitioned),
+    "problems.problem_from_spec": lambda _: case(
+        problems.problem_from_spec,
+        spec=({"preset": "tiger"}, [*mappings(), *values({}, {"preset": "none"}, {"preset": 3}, {"preset": "tiger", "x": 3})]),
+        device=("cpu", devices()),
     ),
-    "envs.symmetries": lambda _: case(envs.symmetries, model=repair_model()),
-    "envs.Symmetry.__call__": lambda _: case(
-        envs.symmetries(model())[1], y=(state(), no_states(state(), "belief", "location"))
+    "problems.make_problem": lambda _: case(
+        problems.make_problem, name=("line3", choices()), partitioned=(True, flags()), device=("cpu", devices())
+    ),
+    "envs.repair.symmetries": lambda _: case(repair.symmetries, model=repair_model()),
+    "envs.repair.Symmetry.__call__": lambda _: case(
+        repair.symmetries(model())[1], y=(state(), no_states(state(), "belief", "location"))
     ),
 }
 
 MODULES = {
-    "modules.GreedyRepair": lambda _: case(GreedyRepair, model=repair_model(), damage_threshold=(0.0, numbers("[0, 1)"))),
-    "modules.GreedyRepair.forward": lambda _: on_entries(greedy(), "belief", "location"),
-    "modules.UrgencyRepair": lambda _: case(
-        modules.UrgencyRepair, lambda made: made(state()), model=repair_model(), exponent=(3.0, numbers("[0, inf)"))
+    "modules.repair.GreedyRepair": lambda _: case(GreedyRepair, model=repair_model(), damage_threshold=(0.0, numbers("[0, 1)"))),
+    "modules.repair.GreedyRepair.forward": lambda _: on_entries(greedy(), "belief", "location"),
+    "modules.repair.UrgencyRepair": lambda _: case(
+        repair_modules.UrgencyRepair, lambda made: made(state()), model=repair_model(), exponent=(3.0, numbers("[0, inf)"))
     ),
-    "modules.UrgencyRepair.forward": lambda _: on_entries(modules.UrgencyRepair(model()), "belief", "location"),
+    "modules.repair.UrgencyRepair.forward": lambda _: on_entries(repair_modules.UrgencyRepair(model()), "belief", "location"),
     "modules.FlatEncoder": lambda _: case(FlatEncoder, model=belief_model()),
     "modules.FlatEncoder.forward": lambda _: case(
         FlatEncoder(model()), y=(state(), no_states(state(), "belief", "location"))
     ),
-    "modules.RelativeEncoder": lambda _: case(modules.RelativeEncoder, model=repair_model()),
-    "modules.RelativeEncoder.forward": lambda _: case(
-        modules.RelativeEncoder(model()), y=(state(), no_states(state(), "belief", "location"))
+    "modules.repair.RelativeEncoder": lambda _: case(repair_modules.RelativeEncoder, model=repair_model()),
+    "modules.repair.RelativeEncoder.forward": lambda _: case(
+        repair_modules.RelativeEncoder(model()), y=(state(), no_states(state(), "belief", "location"))
     ),
     "modules.PolicyNetwork": lambda _: case(
         modules.PolicyNetwork,
@@ -327,10 +342,10 @@ MODULES = {
     ),
     "modules.PolicyCost.forward": lambda _: on_tensordict(policy_cost(), (state(), states(state()))),
     "modules.ZeroCost": lambda _: on_entries(ZeroCost(), "belief"),
-    "modules.SteadyStateCost": lambda _: case(modules.SteadyStateCost, model=repair_model()),
-    "modules.SteadyStateCost.forward": lambda _: on_entries(modules.SteadyStateCost(model()), "belief"),
-    "modules.NeverRepairCost": lambda _: case(NeverRepairCost, model=repair_model()),
-    "modules.NeverRepairCost.forward": lambda _: on_entries(NeverRepairCost(model()), "belief"),
+    "modules.repair.SteadyStateCost": lambda _: case(repair_modules.SteadyStateCost, model=repair_model()),
+    "modules.repair.SteadyStateCost.forward": lambda _: on_entries(repair_modules.SteadyStateCost(model()), "belief"),
+    "modules.repair.NeverRepairCost": lambda _: case(NeverRepairCost, model=repair_model()),
+    "modules.repair.NeverRepairCost.forward": lambda _: on_entries(NeverRepairCost(model()), "belief"),
     "modules.AfterSteps": lambda _: case(
         modules.AfterSteps,
         lambda made: modules.TruncatedRollout(model(), greedy(), truncation=made, terminal_cost=ZeroCost())(state(), KEYS),

@@ -53,7 +53,8 @@ from _valid import (
 )
 
 from torchrl_pomdp import collectors, modules, objectives, trainers
-from torchrl_pomdp.modules import FlatEncoder, NeverRepairCost, ZeroCost
+from torchrl_pomdp.modules import FlatEncoder, ZeroCost
+from torchrl_pomdp.modules.repair import NeverRepairCost
 from torchrl_pomdp.trainers import checkpoint, run
 
 __all__ = ["COLLECTORS", "TRAINERS"]
@@ -213,6 +214,7 @@ TRAINERS = {
         path=(written(folder / "a.pt"), [
             *paths(), *(Hostile(path.name, path, names=(path.name,)) for path in (folder, folder / "none.pt"))
         ]),
+        problem=(None, a_problem()[1]),
         device=("cpu", devices()),
     ),
     "trainers.checkpoint.open_run_folder": lambda folder: case(
@@ -222,7 +224,7 @@ TRAINERS = {
     ),
     "trainers.run.TrainingRun": lambda _: case(
         run.TrainingRun,
-        problem=("line3", choices()),
+        problem=a_problem(),
         algorithm=("API", choices()),
         base=("greedy", choices()),
         config=a_config(),
@@ -230,11 +232,9 @@ TRAINERS = {
         online_states=(0, integers(0)),
         online_trajectories=(1, integers(1)),
     ),
-    "trainers.run.TrainingRun.make_problem": lambda _: case(run.TrainingRun("line3").make_problem, device=("cpu", devices())),
     "trainers.run.TrainingRun.carry_out": lambda folder: case(
-        run.TrainingRun("line3", "API", config=config(), states=8, online_states=0, online_trajectories=1).carry_out,
+        run.TrainingRun(a_problem()[0], "API", config=config(), states=8, online_states=0, online_trajectories=1).carry_out,
         folder=(folder / "run", paths()),
-        device=("cpu", devices()),
         progress=(False, flags()),
         report=callback(),
         on_labels=callback(),

@@ -27,9 +27,11 @@ from _hostile import (
 )
 from tensordict import TensorDictBase
 
-from torchrl_pomdp import collectors, envs, evaluation, files, modules, reproduce, trainers
-from torchrl_pomdp.envs import RepairModel
-from torchrl_pomdp.modules import FlatEncoder, GreedyRepair, NeverRepairCost, OnEntering, RolloutPolicy, ZeroCost
+from torchrl_pomdp import collectors, envs, evaluation, files, modules, problems, reproduce, trainers
+from torchrl_pomdp.envs import repair
+from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.modules import FlatEncoder, OnEntering, RolloutPolicy, ZeroCost
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
 from torchrl_pomdp.trainers import checkpoint, run
 
 Argument = tuple[Any, list[Hostile]]
@@ -88,13 +90,13 @@ ITERATIONS = [
 
 
 @functools.cache
-def problem(*, partitioned: bool = True) -> envs.Problem:
-    return envs.make_problem("line3", partitioned=partitioned)
+def problem(*, partitioned: bool = True) -> problems.Problem:
+    return problems.make_problem("line3", partitioned=partitioned)
 
 
 @functools.cache
 def two_robots() -> RepairModel:
-    return RepairModel(envs.line(3), CHAIN, COSTS, 0.9, num_robots=2)
+    return RepairModel(repair.line(3), CHAIN, COSTS, 0.9, num_robots=2)
 
 
 def model() -> RepairModel:
@@ -197,7 +199,7 @@ def quick_reproduce(*args: Any, **kwargs: Any) -> str:
 
 
 def repair_model() -> Argument:
-    return model(), objects(envs.tiger(), RepairModel)
+    return model(), objects(problems.tiger().model, RepairModel)
 
 
 def belief_model() -> Argument:
@@ -205,7 +207,7 @@ def belief_model() -> Argument:
 
 
 def a_problem(*, partitioned: bool = True) -> Argument:
-    return problem(partitioned=partitioned), objects(model(), envs.Problem)
+    return problem(partitioned=partitioned), objects(model(), problems.Problem)
 
 
 def a_policy() -> Argument:

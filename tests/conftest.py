@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from torchrl import logger as torchrl_logger
 
-from torchrl_pomdp.envs import make_problem
+from torchrl_pomdp.problems import make_problem
 
 torchrl_logger.setLevel("WARNING")
 

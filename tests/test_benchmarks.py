@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout
+from torchrl_pomdp.modules import TruncatedRollout
+from torchrl_pomdp.modules.repair import GreedyRepair
 
 ROOT = Path(__file__).parents[1]
 

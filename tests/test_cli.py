@@ -13,9 +13,9 @@ import torch
 from torchrl_pomdp import commands, files
 from torchrl_pomdp.cli import main
 from torchrl_pomdp.envs import BeliefEnv
+from torchrl_pomdp.envs.repair import trajectory_figure
 from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
-from torchrl_pomdp.modules import GreedyRepair
-from torchrl_pomdp.report import trajectory_figure
+from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.trainers import load_checkpoint
 
 TINY = (

@@ -8,10 +8,12 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
-from torchrl_pomdp.envs import BeliefEnv, FixedBelief, TabularModel, make_problem
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief, TabularModel
 from torchrl_pomdp.evaluation import discounted_costs
-from torchrl_pomdp.modules import GreedyRepair, PartitionedPolicy, PolicyNetwork, RelativeEncoder, RolloutPolicy
+from torchrl_pomdp.modules import PartitionedPolicy, PolicyNetwork, RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.objectives import ClassificationLoss
+from torchrl_pomdp.problems import make_problem
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 

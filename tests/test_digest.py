@@ -14,9 +14,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import CalibratedStart, grid, line, make_problem
+from torchrl_pomdp.envs.repair import CalibratedStart, grid, line
 from torchrl_pomdp.identity import digest, identity
-from torchrl_pomdp.modules import FlatEncoder, GreedyRepair, PolicyNetwork, RolloutPolicy
+from torchrl_pomdp.modules import FlatEncoder, PolicyNetwork, RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.problems import make_problem
 
 
 def adds(n):

@@ -9,8 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchrl_pomdp.envs import FixedBelief, TabularModel, tiger
+from torchrl_pomdp.envs import FixedBelief, TabularModel
 from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
+from torchrl_pomdp.problems import tiger
 from torchrl_pomdp.trainers.policy_iteration import _judge
 
 
@@ -53,7 +54,7 @@ def test_a_constant_on_all_costs_changes_no_verdict(offset, change, seed):
 
 def test_a_constant_on_all_stage_costs_changes_no_verdict():
     """A model whose every stage is 50 cheaper is the same problem."""
-    known, start = tiger(), FixedBelief(torch.tensor([0.5, 0.5]))
+    known, start = tiger().model, FixedBelief(torch.tensor([0.5, 0.5]))
 
     def listen_until(sure):
         return lambda y: y.set("action", torch.where(y["belief"].amax(-1) > sure, 2 - y["belief"].argmax(-1), 0))

@@ -10,18 +10,12 @@ import torch
 
 from torchrl_pomdp import kept as module
 from torchrl_pomdp.collectors import PartSampler, PolicyEvaluation, RolloutImprovement, labels
-from torchrl_pomdp.envs import BeliefEnv, make_problem
+from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.files import load_tensors, save_tensors
 from torchrl_pomdp.kept import keep, kept
-from torchrl_pomdp.modules import (
-    FlatEncoder,
-    GreedyRepair,
-    NeverRepairCost,
-    PolicyCost,
-    PolicyNetwork,
-    RolloutPolicy,
-    UrgencyRepair,
-)
+from torchrl_pomdp.modules import FlatEncoder, PolicyCost, PolicyNetwork, RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, UrgencyRepair
+from torchrl_pomdp.problems import make_problem
 
 CONTENT = {"x": torch.arange(6.0).view(2, 3), "deep": {"n": 3, "text": "abc", "flag": True}, "seconds": 0.25}
 

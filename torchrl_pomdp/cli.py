@@ -29,13 +29,14 @@ class Train:
     """Train policies by approximate policy iteration; the same command goes on with an interrupted run."""
 
     problem: tyro.conf.Positional[str]
-    """Name of the problem, such as linear20."""
+    """The problem: a name such as linear20, see the command problems; a file .toml or .POMDP; or module:function of one's own
+    code."""
 
     algorithm: Literal["pAPI-NT", "pAPI-T", "API"] = "pAPI-NT"
     """pAPI-NT: partitioned; pAPI-T: partitioned, with simulations truncated at the endgame; API: a single part."""
 
-    base: Literal["greedy", "urgency"] = "greedy"
-    """Base policy that is improved first."""
+    base: str | None = None
+    """Base policy that is improved first; by default the problem's first, such as greedy."""
 
     config: tyro.conf.OmitArgPrefixes[Numbers] = field(default_factory=Numbers)
 
@@ -54,16 +55,16 @@ class Train:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare a policy with the greedy policy from the same start states."""
+    """Compare a policy with the problem's base policies from the same start states."""
 
     policy: tyro.conf.Positional[str]
-    """Path of a checkpoint, or greedy, or urgency."""
+    """Path of a checkpoint, or with --problem the name of a base policy, such as greedy."""
 
     online: bool = False
     """Whether the policy is improved online, by one-step lookahead with rollout."""
 
-    problem: str = "linear20"
-    """Problem for greedy and urgency; a checkpoint knows its own."""
+    problem: str | None = None
+    """Problem, as for the command train; a checkpoint knows its own unless it is of one's own code."""
 
     states: int = 1000
     """Start states."""

@@ -8,22 +8,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from tensordict.nn import TensorDictModuleBase
 
-from torchrl_pomdp.checks import check_choice, check_integer, check_seed
+from torchrl_pomdp.checks import check_integer, check_seed
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
-from torchrl_pomdp.envs import PRESETS, BeliefEnv, Problem, make_problem
+from torchrl_pomdp.envs import BeliefEnv
+from torchrl_pomdp.envs.repair import RepairModel, trajectory_figure
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import check_folder, write_json
-from torchrl_pomdp.modules import NeverRepairCost, Policy
+from torchrl_pomdp.modules import Policy
 from torchrl_pomdp.noise import fold, seed_keys
+from torchrl_pomdp.problems import Problem
+from torchrl_pomdp.problems.find import find_problem
 from torchrl_pomdp.provenance import provenance
-from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, ratio_texts, table, trajectory_figure
+from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, ratio_texts, table
 from torchrl_pomdp.reproduce import EXPERIMENTS
 from torchrl_pomdp.reproduce import reproduce as reproduce_experiment
 from torchrl_pomdp.tensor_checks import check_device
 from torchrl_pomdp.trainers import load_checkpoint, r_nt
-from torchrl_pomdp.trainers.architecture import BASE_POLICIES
 from torchrl_pomdp.trainers.run import TrainingRun
 
 if TYPE_CHECKING:
@@ -37,22 +38,23 @@ __all__ = ["evaluate", "reproduce", "train"]
 def train(command: Train) -> None:
     """Carry out a training run; print its table, then draw its pictures."""
     config = PolicyIterationConfig(**asdict(command.config))
-    run = TrainingRun(command.problem, command.algorithm, command.base, config, command.states, command.online_states)
-    device = check_device("device", command.device)
-    default = Path("runs") / f"{command.problem}-{command.algorithm}-{command.base}-seed{config.seed}"
+    given = find_problem(command.problem, check_device("device", command.device))
+    run = TrainingRun(given, command.algorithm, command.base or given.baseline, config, command.states, command.online_states)
+    problem = run.problem
+    default = Path("runs") / f"{problem.name}-{command.algorithm}-{run.base}-seed{config.seed}"
     out = check_folder("out", command.out or default)
-    problem = run.make_problem(device)
     print(f"{problem.name}: {problem.model.describe()}\nrun folder: {out}", flush=True)
-    comparisons = run.carry_out(out, device=device, progress=True, report=_tell)
+    comparisons = run.carry_out(out, progress=True, report=partial(_tell, problem.baseline))
     results = [Result(name, comparison) for name, comparison in comparisons.items()]
     print(f"\n{table(results)}\n", flush=True)
     write_json(out / "provenance.json", provenance())
-    best = load_checkpoint(out / "best.pt", device=device)
-    title = f"{problem.name}, {command.states} start states; below each policy its ratio to greedy"
+    best = load_checkpoint(out / "best.pt", problem=problem)
+    title = f"{problem.name}, {command.states} start states; below each policy its ratio to {problem.baseline}"
     figures = {
         out / "costs.png": partial(cost_figure, results, title),
-        out / "trajectory.png": partial(_trajectory_figure, problem, best.policy),
     }
+    if isinstance(problem.model, RepairModel):
+        figures[out / "trajectory.png"] = partial(_trajectory_figure, problem, problem.model, best.policy)
     print(draw(figures))
     if best.iteration == 0:
         print(
@@ -61,20 +63,20 @@ def train(command: Train) -> None:
         )
 
 
-def _tell(name: str, comparison: Comparison) -> None:
+def _tell(baseline: str, name: str, comparison: Comparison) -> None:
     ratio, interval = ratio_texts(comparison.ratio)
-    of_greedy = f"{ratio} of greedy ({interval})" if comparison.ratio else f"cost {interval_text(comparison.cost)}"
-    print(f"{name}: {of_greedy}", flush=True)
+    of_baseline = f"{ratio} of {baseline} ({interval})" if comparison.ratio else f"cost {interval_text(comparison.cost)}"
+    print(f"{name}: {of_baseline}", flush=True)
 
 
-def _trajectory_figure(problem: Problem, policy: Policy) -> Figure:
+def _trajectory_figure(problem: Problem, model: RepairModel, policy: Policy) -> Figure:
     """The trajectory of ``policy`` from the first start state of the evaluations."""
     env = BeliefEnv(problem.model, problem.start, seed=EVALUATION_SEED)
     first = torch.tensor(0, device=problem.model.device)
     y = env.reset(problem.start(fold(seed_keys(EVALUATION_SEED, first), 0)), set_state=True)
     with torch.no_grad():
         trajectory = env.rollout(200, policy, tensordict=y, auto_reset=False)
-    return trajectory_figure(problem.model, trajectory, f"{problem.name}: one trajectory of the best policy")
+    return trajectory_figure(model, trajectory, f"{problem.name}: one trajectory of the best policy")
 
 
 def evaluate(command: Evaluate) -> None:
@@ -83,7 +85,7 @@ def evaluate(command: Evaluate) -> None:
     check_integer("trajectories", command.trajectories, 1, 10**6)
     check_seed("seed", command.seed)
     problem, policy, name = _named_policy(command, check_device("device", command.device))
-    policies: dict[str, Policy] = {base: make(problem.model) for base, make in BASE_POLICIES.items()}
+    policies: dict[str, Policy] = dict(problem.base_policies)
     if command.online:
         name, policy = f"{name} + R-NT", r_nt(problem, policy, trajectories=command.trajectories)
     policies.setdefault(name, policy)
@@ -94,23 +96,22 @@ def evaluate(command: Evaluate) -> None:
             problem.start,
             num_states=command.states,
             seed=command.seed,
-            terminal_cost=NeverRepairCost(problem.model),
+            terminal_cost=problem.pessimistic_cost,
             progress=True,
             name=f"evaluate {name}",
         )
         for name, policy in policies.items()
     }
     print(f"{problem.name}: {problem.model.describe()}; {command.states} start states, seed {command.seed}\n")
-    print(table([Result(name, compare(cost, costs["greedy"])) for name, cost in costs.items()]))
+    print(table([Result(name, compare(cost, costs[problem.baseline])) for name, cost in costs.items()]))
 
 
-def _named_policy(command: Evaluate, device: torch.device) -> tuple[Problem, TensorDictModuleBase, str]:
+def _named_policy(command: Evaluate, device: torch.device) -> tuple[Problem, Policy, str]:
     """The problem, the policy and its name that ``evaluate`` was asked for."""
-    check_choice("problem", command.problem, sorted(PRESETS))
-    if command.policy in BASE_POLICIES:
-        problem = make_problem(command.problem, device=device)
-        return problem, BASE_POLICIES[command.policy](problem.model), command.policy
-    checkpoint = load_checkpoint(command.policy, device=device)
+    given = None if command.problem is None else find_problem(command.problem, device)
+    if given is not None and command.policy in given.base_policies:
+        return given, given.base_policies[command.policy], command.policy
+    checkpoint = load_checkpoint(command.policy, problem=given, device=device)
     return checkpoint.problem, checkpoint.policy, checkpoint.name
 
 
@@ -126,7 +127,7 @@ def reproduce(command: Reproduce) -> None:
         runs=command.runs,
         out=command.out,
         device=command.device,
-        report=lambda run, name, comparison: _tell(f"{run}, {name}", comparison),
+        report=lambda run, name, comparison: _tell("greedy", f"{run}, {name}", comparison),
         tell=lambda text: print(f"\n{text}", flush=True),
         progress=True,
     )

@@ -73,8 +73,9 @@ class PolicyIterationConfig:
     symmetries: bool = True
     """Whether mirror images of labelled states are labelled states too."""
 
-    encoder: Literal["relative", "flat"] = "relative"
-    """Network input: beliefs at offsets from the robot, or the flattened beliefs and one-hot location of the paper."""
+    encoder: Literal["own", "flat"] = "own"
+    """Network input: the problem's own encoding, for repair beliefs at offsets from the robot; or the flattened beliefs and
+    one-hot location of the paper."""
 
     hidden: tuple[int, ...] = (256, 64)
     """Sizes of the policy networks' hidden layers."""

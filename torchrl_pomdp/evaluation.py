@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_text
 from torchrl_pomdp.config import MAX_STATES
-from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
+from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.progress import progress_bar
@@ -97,8 +97,8 @@ def discounted_costs(
         ValueError: if ``num_states`` is not positive, or by :class:`TruncatedRollout`.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("linear20")
         >>> costs = discounted_costs(problem.model, GreedyRepair(problem.model), problem.start, num_states=50)
         >>> estimate(costs).count

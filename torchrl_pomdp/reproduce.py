@@ -25,9 +25,10 @@ from torchrl_pomdp.checks import (
     check_text,
 )
 from torchrl_pomdp.config import PolicyIterationConfig
-from torchrl_pomdp.envs import PRESETS
 from torchrl_pomdp.evaluation import Comparison, Estimate
 from torchrl_pomdp.files import check_folder, write_bytes, write_json
+from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.problems.repair import REPAIR_PRESETS
 from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import (
@@ -95,7 +96,7 @@ class Experiment:
     def __post_init__(self) -> None:
         check_text("name", self.name)
         for problem in check_sequence("problems", self.problems, str, least=1):
-            check_choice("problems", problem, sorted(PRESETS))
+            check_choice("problems", problem, sorted(REPAIR_PRESETS))
         for algorithm in check_sequence("algorithms", self.algorithms, str, least=1):
             check_choice("algorithms", algorithm, ALGORITHMS)
         check_integer("states", self.states, 1, 10**9)
@@ -134,7 +135,7 @@ def settings_config(settings: Literal["paper", "tuned"], problem: str, scale: fl
         100000
     """
     check_choice("settings", settings, ("paper", "tuned"))
-    check_choice("problem", problem, sorted(PRESETS))
+    check_choice("problem", problem, sorted(REPAIR_PRESETS))
     check_number("scale", scale, "(0, 100]")
     samples = max(1, round(scale * _SAMPLES.get(problem, _MORE_SAMPLES)))
     common = PolicyIterationConfig(samples_per_part=samples, value_samples=samples, seed=seed)
@@ -159,6 +160,7 @@ def plan(
     scale: float,
     seed: int,
     problems: Sequence[str] = (),
+    device: torch.device | str = "cpu",
 ) -> dict[str, TrainingRun]:
     """The training runs of an experiment by name.
 
@@ -182,7 +184,7 @@ def plan(
                 config = replace(config, samples_per_part=6 * config.samples_per_part)
             name = f"{problem}-{algorithm}-{settings}-{base}-scale{scale:g}-seed{seed}"
             runs[name] = TrainingRun(
-                problem,
+                make_problem(problem, device=device),
                 algorithm,
                 base,
                 config,
@@ -240,7 +242,7 @@ def reproduce(
     check_callable("tell", tell)
     device = check_device("device", device)
     runs, out = check_folder("runs", runs), check_folder("out", out)
-    planned = plan(experiment, settings, base, scale, seed, problems)
+    planned = plan(experiment, settings, base, scale, seed, problems, device)
     results: dict[str, dict[str, Comparison]] = {}
     iterations: dict[str, list[dict[str, Any]]] = {}
     costs: dict[str, dict[str, Tensor]] = {}
@@ -250,13 +252,12 @@ def reproduce(
         for name, run in planned.items():
             results[name] = run.carry_out(
                 runs / name,
-                device=device,
                 progress=progress,
                 report=partial(report, name),
                 on_labels=partial(_advance, bar),
             )
             iterations[name] = json.loads((runs / name / "iterations.json").read_text())
-            costs.setdefault(run.problem, {}).update(run.costs(runs / name, results[name]))
+            costs.setdefault(run.problem.name, {}).update(run.costs(runs / name, results[name]))
     title = f"{experiment.name}-{settings}-{base}-scale{scale:g}-seed{seed}"
     if problems:
         title = f"{title}-{'-'.join(problems)}"
@@ -281,7 +282,7 @@ def _write(
     content = {
         **about,
         "provenance": provenance(),
-        "runs": {name: asdict(run) for name, run in planned.items()},
+        "runs": {name: run.to_dict() for name, run in planned.items()},
         "results": {name: {p: asdict(c) for p, c in found.items()} for name, found in results.items()},
         "paired": {
             problem: {p: {r: e and asdict(e) for r, e in row.items()} for p, row in rows.items()}
@@ -290,9 +291,9 @@ def _write(
         "iterations": iterations,
     }
     write_json(out / f"{title}.json", content)
-    text = comparison_table({name: (run.problem, results[name]) for name, run in planned.items()})
+    text = comparison_table({name: (run.problem.name, results[name]) for name, run in planned.items()})
     text += "".join(f"\n\n{paired_table(problem, rows)}" for problem, rows in paired.items())
-    text += f"\n\n{effort_table({f'{run.problem}, {run.algorithm}': iterations[name] for name, run in planned.items()})}"
+    text += f"\n\n{effort_table({f'{run.problem.name}, {run.algorithm}': iterations[name] for name, run in planned.items()})}"
     write_bytes(out / f"{title}.md", (text + "\n").encode())
     return text
 
@@ -360,12 +361,12 @@ def _figures(
     figures: dict[Path, Callable[[], Figure]] = {}
     lines = {}
     for name, run in planned.items():
-        found, label = results[name], f"{run.problem}, {run.algorithm}"
+        found, label = results[name], f"{run.problem.name}, {run.algorithm}"
         bars = [Result(policy, comparison) for policy, comparison in found.items()]
-        path = out / f"{title}-{run.problem}-{run.algorithm}.png"
+        path = out / f"{title}-{run.problem.name}-{run.algorithm}.png"
         figures[path] = partial(cost_figure, bars, f"{name}; below each policy its ratio to greedy")
         lines[label] = [found[run.base]] + [found[policy] for policy in found if is_iteration(policy)]
-    times = {f"{run.problem}, {run.algorithm}": iterations[name] for name, run in planned.items()}
+    times = {f"{run.problem.name}, {run.algorithm}": iterations[name] for name, run in planned.items()}
     figures[out / f"{title}-iterations.png"] = partial(iteration_figure, lines)
     figures[out / f"{title}-time.png"] = partial(time_figure, times)
     return figures

@@ -45,11 +45,14 @@ from torchrl import logger
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement, StateMemory, training_states
-from torchrl_pomdp.envs import BeliefEnv, make_problem
+from torchrl_pomdp.envs import BeliefEnv
+from torchrl_pomdp.envs.repair import trajectory_figure
 from torchrl_pomdp.evaluation import compare, discounted_costs
-from torchrl_pomdp.modules import GreedyRepair, PartitionedPolicy, PolicyNetwork, RelativeEncoder, RolloutPolicy
+from torchrl_pomdp.modules import PartitionedPolicy, PolicyNetwork, RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.objectives import ClassificationLoss
-from torchrl_pomdp.report import Result, cost_figure, table, trajectory_figure
+from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.report import Result, cost_figure, table
 
 logger.setLevel("WARNING")
 

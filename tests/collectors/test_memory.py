@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from torchrl_pomdp.collectors import StateMemory, training_states
-from torchrl_pomdp.envs import BeliefEnv, FixedBelief, make_problem, tiger
-from torchrl_pomdp.modules import GreedyRepair
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief
+from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.problems import make_problem, tiger
 
 
 def visit(problem, keys, **options):
@@ -72,7 +73,7 @@ def test_exploration_leaves_the_policys_trajectories(linear20):
 
 
 def test_models_without_a_partition_have_one_part():
-    memory = StateMemory(tiger(), retain=1.0)
+    memory = StateMemory(tiger().model, retain=1.0)
     memory.visit(lambda y: y.set("action", torch.zeros(y.batch_size, dtype=torch.int64)), FixedBelief(torch.tensor([0.5, 0.5])),
                  torch.arange(4), max_steps=5)  # fmt: skip
     assert 1 < memory.count(0) <= 2 * 5 + 1

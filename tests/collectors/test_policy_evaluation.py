@@ -10,17 +10,8 @@ from _oracles import exact_cost
 
 from torchrl_pomdp.collectors import PartSampler, PolicyEvaluation
 from torchrl_pomdp.envs import BeliefEnv
-from torchrl_pomdp.modules import (
-    FlatEncoder,
-    GreedyRepair,
-    NeverRepairCost,
-    PartitionedPolicy,
-    PartitionedValue,
-    PolicyCost,
-    SteadyStateCost,
-    UrgencyRepair,
-    ValueNetwork,
-)
+from torchrl_pomdp.modules import FlatEncoder, PartitionedPolicy, PartitionedValue, PolicyCost, ValueNetwork
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, SteadyStateCost, UrgencyRepair
 from torchrl_pomdp.objectives import ValueLoss
 
 

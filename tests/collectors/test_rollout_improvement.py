@@ -8,8 +8,10 @@ from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import PendulumEnv
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
-from torchrl_pomdp.envs import BeliefEnv, FixedBelief, make_problem, tiger
-from torchrl_pomdp.modules import GreedyRepair, RolloutPolicy, ZeroCost
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief
+from torchrl_pomdp.modules import RolloutPolicy, ZeroCost
+from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.problems import make_problem, tiger
 
 LABEL = partial(RolloutPolicy, trajectories=2, max_steps=80, terminal_cost=ZeroCost())
 
@@ -106,7 +108,7 @@ def test_keeps_its_own_copy_of_the_policy(linear20):
 
 
 def test_tabular_models_are_labelled_by_the_same_collector():
-    model = tiger()
+    model = tiger().model
     start = FixedBelief(torch.tensor([0.5, 0.5]))
 
     def open_left(y):

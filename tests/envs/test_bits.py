@@ -7,15 +7,13 @@ import torch
 from _oracles import random_states
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import (
+from torchrl_pomdp.envs import InPart, Mixture, TabularModel
+from torchrl_pomdp.envs.repair import (
     CalibratedStart,
     Graph,
-    InPart,
-    Mixture,
     RandomState,
     RepairModel,
     RepairPartition,
-    TabularModel,
     UniformStart,
     damage_chain,
     grid,

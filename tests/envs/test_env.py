@@ -7,9 +7,12 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_pomdp.envs import BeliefEnv, FixedBelief, RandomState, RepairModel, damage_chain, line, make_problem, tiger
-from torchrl_pomdp.modules import GreedyRepair, TruncatedRollout, ZeroCost
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief
+from torchrl_pomdp.envs.repair import RandomState, RepairModel, damage_chain, line
+from torchrl_pomdp.modules import TruncatedRollout, ZeroCost
+from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.modules.scenarios import Scenarios
+from torchrl_pomdp.problems import make_problem, tiger
 
 
 def repair_env(batch_size=(), seed=0):
@@ -18,7 +21,7 @@ def repair_env(batch_size=(), seed=0):
 
 
 def tiger_env(batch_size=(), seed=0):
-    return BeliefEnv(tiger(), FixedBelief(torch.tensor([0.5, 0.5])), batch_size=batch_size, seed=seed)
+    return BeliefEnv(tiger().model, FixedBelief(torch.tensor([0.5, 0.5])), batch_size=batch_size, seed=seed)
 
 
 @pytest.mark.parametrize("make", [repair_env, tiger_env])

@@ -10,16 +10,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from torchrl_pomdp.collectors import PartSampler
-from torchrl_pomdp.envs import (
-    CalibratedStart,
-    InPart,
-    Mixture,
-    RandomState,
-    RepairPartition,
-    SinglePart,
-    grid,
-    line,
-)
+from torchrl_pomdp.envs import InPart, Mixture, SinglePart
+from torchrl_pomdp.envs.repair import CalibratedStart, RandomState, RepairPartition, grid, line
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 
 

@@ -10,26 +10,20 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import (
-    BeliefEnv,
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief, InPart, Mixture, SinglePart, TabularModel
+from torchrl_pomdp.envs.repair import (
     CalibratedStart,
-    FixedBelief,
     Graph,
-    InPart,
-    Mixture,
     RandomState,
     RepairModel,
     RepairPartition,
-    SinglePart,
-    TabularModel,
     UniformStart,
     damage_chain,
     grid,
     line,
-    make_problem,
     symmetries,
-    tiger,
 )
+from torchrl_pomdp.problems import make_problem, tiger
 
 NAN, INF, HUGE = math.nan, math.inf, torch.tensor([0.0, 1e300], dtype=torch.float64)
 PATH = {
@@ -189,7 +183,7 @@ MODEL = make_problem("line3").model
     [
         (lambda: damage_chain("ab"), TypeError, "degradation"),
         (lambda: damage_chain((NAN,)), ValueError, "degradation"),
-        (lambda: CalibratedStart(tiger()), TypeError, "model"),
+        (lambda: CalibratedStart(tiger().model), TypeError, "model"),
         (lambda: CalibratedStart(MODEL, NAN), ValueError, "damaged_fraction"),
         (lambda: CalibratedStart(MODEL, observe_start=1), TypeError, "observe_start"),
         (lambda: UniformStart(MODEL, (5,)), ValueError, "robots"),
@@ -202,7 +196,7 @@ MODEL = make_problem("line3").model
         (lambda: RandomState(MODEL, max_age=1.5), TypeError, "max_age"),
         (lambda: InPart(MODEL, 3, 0), TypeError, "proposal"),
         (lambda: InPart(MODEL, len, 0.0), TypeError, "part"),
-        (lambda: InPart(tiger(), len, 0), ValueError, "part"),
+        (lambda: InPart(tiger().model, len, 0), ValueError, "part"),
         (lambda: InPart(MODEL, len, 0, 0), ValueError, "max_tries"),
         (lambda: Mixture([], []), ValueError, "generators"),
         (lambda: Mixture([3], [1.0]), TypeError, "generators"),
@@ -218,12 +212,12 @@ MODEL = make_problem("line3").model
         (lambda: FixedBelief(torch.tensor([NAN, 1.0])), ValueError, "belief"),
         (lambda: RepairPartition(line(2), HUGE), ValueError, "costs"),
         (lambda: RepairPartition(line(2), torch.tensor([0.0, NAN])), ValueError, "costs"),
-        (lambda: symmetries(tiger()), TypeError, "model"),
+        (lambda: symmetries(tiger().model), TypeError, "model"),
         (lambda: make_problem("line4"), ValueError, "name"),
         (lambda: make_problem(3), TypeError, "name"),
         (lambda: make_problem("line3", partitioned=1), TypeError, "partitioned"),
         (lambda: make_problem("line3", device="nonsense"), ValueError, "device"),
-        (lambda: tiger(2.0), ValueError, "discount"),
+        (lambda: tiger(2.0).model, ValueError, "discount"),
         (lambda: dataclasses.replace(make_problem("line3"), training=()), ValueError, "training must hold 6"),
         (lambda: dataclasses.replace(make_problem("line3"), training=(3,) * 6), TypeError, "training"),
         (lambda: dataclasses.replace(make_problem("line3"), model=3), TypeError, "model"),
@@ -307,7 +301,7 @@ def test_what_robots_see_together_and_after_a_repair():
         never.estimator(y, torch.tensor([0]), torch.tensor([1]))
 
 
-@pytest.mark.parametrize("model", [MODEL, tiger()])
+@pytest.mark.parametrize("model", [MODEL, tiger().model])
 def test_beliefs_must_sum_to_one_and_may_be_rounded(model):
     y = model.drawn(CalibratedStart(MODEL) if model is MODEL else FixedBelief(torch.tensor([0.5, 0.5])), torch.arange(3))
     rounded = y.clone().set("belief", (y["belief"] * (1 + 4e-7)).clone())

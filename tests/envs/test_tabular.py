@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import TabularModel, tiger
+from torchrl_pomdp.envs import TabularModel
+from torchrl_pomdp.problems import tiger
 
 
 def random_model(seed, controls=2, states=4, observations=3):

@@ -15,9 +15,11 @@ from torchrl.envs import ActionMask, ObservationNorm, ParallelEnv, SerialEnv, St
 from torchrl.envs.utils import check_env_specs
 from torchrl.modules import RandomPolicy
 
-from torchrl_pomdp.envs import BeliefEnv, CalibratedStart, FixedBelief, RepairModel, damage_chain, line, make_problem, tiger
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief
 from torchrl_pomdp.envs.legal import LegalControls
-from torchrl_pomdp.modules import GreedyRepair
+from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, damage_chain, line
+from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.problems import make_problem, tiger
 
 
 def make(batch=(), seed=None, dtype=torch.float32):
@@ -170,7 +172,7 @@ def test_float64_from_end_to_end():
             assert data["next", "reward"].dtype == dtype
         finally:
             torch.set_default_dtype(torch.float32)
-    model = tiger()
+    model = tiger().model
     double = type(model)(model.transition, model.observation, model.cost, 0.9, dtype=torch.float64)
     env = BeliefEnv(double, FixedBelief(torch.tensor([0.3, 0.7])), batch_size=(2,))
     check_env_specs(env)

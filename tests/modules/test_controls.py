@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_pomdp.collectors import PartSampler, PolicyEvaluation, RolloutImprovement, StateMemory
-from torchrl_pomdp.envs import BeliefEnv, FixedBelief, make_problem, tiger
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief
 from torchrl_pomdp.evaluation import discounted_costs
 from torchrl_pomdp.modules import (
     MultistepLookahead,
@@ -16,6 +16,7 @@ from torchrl_pomdp.modules import (
     TruncatedRollout,
     ZeroCost,
 )
+from torchrl_pomdp.problems import make_problem, tiger
 
 
 def always(control):
@@ -77,7 +78,7 @@ def _collect(kind, model, start, policy):
 MODELS = {
     "line3": (make_problem("line3").model, make_problem("line3").start),
     "two robots": (make_problem("two_robots20").model, make_problem("two_robots20").start),
-    "tiger": (tiger(), FixedBelief(torch.tensor([0.5, 0.5]))),
+    "tiger": (tiger().model, FixedBelief(torch.tensor([0.5, 0.5]))),
 }
 
 

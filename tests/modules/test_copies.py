@@ -12,25 +12,22 @@ import torch
 from torchrl.collectors import MultiSyncCollector
 
 from torchrl_pomdp.collectors import PartSampler, PolicyEvaluation, RolloutImprovement
-from torchrl_pomdp.envs import BeliefEnv, make_problem
+from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.modules import (
     AfterSteps,
-    GreedyRepair,
     MultistepLookahead,
-    NeverRepairCost,
     OnEntering,
     ParallelRollout,
     PartitionedPolicy,
     PartitionedValue,
     PolicyCost,
     PolicyNetwork,
-    RelativeEncoder,
     RolloutPolicy,
-    SteadyStateCost,
     TruncatedRollout,
-    UrgencyRepair,
     ValueNetwork,
 )
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, SteadyStateCost, UrgencyRepair
+from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import PolicyIterationConfig, papi_nt, r_nt, r_t
 
 PROBLEM = make_problem("line3")

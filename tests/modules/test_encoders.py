@@ -12,21 +12,19 @@ from tensordict.nn import TensorDictModule
 from torchrl.objectives.value import GAE
 
 from torchrl_pomdp.collectors import PolicyEvaluation, RolloutImprovement
-from torchrl_pomdp.envs import BeliefEnv, CalibratedStart, Graph, RepairModel, damage_chain, grid, line, symmetries
+from torchrl_pomdp.envs import BeliefEnv
+from torchrl_pomdp.envs.repair import CalibratedStart, Graph, RepairModel, damage_chain, grid, line, symmetries
 from torchrl_pomdp.modules import (
     FlatEncoder,
-    GreedyRepair,
-    NeverRepairCost,
     PartitionedPolicy,
     PartitionedValue,
     PolicyCost,
     PolicyNetwork,
-    RelativeEncoder,
     RolloutPolicy,
-    SteadyStateCost,
     ValueNetwork,
     ZeroCost,
 )
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, SteadyStateCost
 
 ENCODERS = [FlatEncoder, RelativeEncoder]
 PATH = [[-1, 1], [0, 2], [1, 3], [2, -1]]

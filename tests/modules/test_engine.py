@@ -11,21 +11,13 @@ from torch._dynamo import config as dynamo_config
 from torch._dynamo.utils import counters
 from torch._inductor import config as inductor_config
 
-from torchrl_pomdp.envs import CalibratedStart, RepairModel, damage_chain, line, tiger
-from torchrl_pomdp.modules import (
-    AfterSteps,
-    GreedyRepair,
-    NeverRepairCost,
-    OnEntering,
-    PartitionedPolicy,
-    PolicyNetwork,
-    RelativeEncoder,
-    RolloutPolicy,
-    TruncatedRollout,
-)
+from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, damage_chain, line
+from torchrl_pomdp.modules import AfterSteps, OnEntering, PartitionedPolicy, PolicyNetwork, RolloutPolicy, TruncatedRollout
 from torchrl_pomdp.modules.compiling import compiled
 from torchrl_pomdp.modules.lookahead import spread
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder
 from torchrl_pomdp.modules.threads import map_threads
+from torchrl_pomdp.problems import tiger
 
 
 def chain_model(size, drift=0.0, dtype=torch.float32):
@@ -182,7 +174,7 @@ def test_adaptive_allocation_with_exact_first_observations():
     def listen(y):
         return y.set("action", torch.zeros(y.batch_size, dtype=torch.int64))
 
-    policy = RolloutPolicy(tiger(), listen, trajectories=6, allocation="adaptive", leaves="observation", max_steps=80)
+    policy = RolloutPolicy(tiger().model, listen, trajectories=6, allocation="adaptive", leaves="observation", max_steps=80)
     assert policy(TensorDict(y, [2]))["action"].tolist() == [0, 2]
 
 

@@ -9,25 +9,23 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import RepairPartition, TabularModel, grid, line
+from torchrl_pomdp.envs import TabularModel
+from torchrl_pomdp.envs.repair import RepairPartition, grid, line
 from torchrl_pomdp.modules import (
     AfterSteps,
     FlatEncoder,
-    GreedyRepair,
     MultistepLookahead,
-    NeverRepairCost,
     OnEntering,
     ParallelRollout,
     PartitionedPolicy,
     PartitionedValue,
     PolicyCost,
     PolicyNetwork,
-    RelativeEncoder,
     RolloutPolicy,
-    UrgencyRepair,
     ValueNetwork,
     ZeroCost,
 )
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, UrgencyRepair
 
 COUNT = 90
 

@@ -7,17 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import BeliefEnv, FixedBelief, RepairModel, UniformStart, damage_chain, line, tiger
-from torchrl_pomdp.modules import (
-    FlatEncoder,
-    GreedyRepair,
-    NeverRepairCost,
-    PartitionedPolicy,
-    PolicyNetwork,
-    RelativeEncoder,
-    RolloutPolicy,
-    TruncatedRollout,
-)
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief
+from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, line
+from torchrl_pomdp.modules import FlatEncoder, PartitionedPolicy, PolicyNetwork, RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder
+from torchrl_pomdp.problems import tiger
 
 # Optimal value of Tiger from the uniform belief at discount 0.95, as a cost.
 TIGER_OPTIMUM = -19.371368
@@ -94,7 +88,7 @@ def test_labels_do_not_depend_on_batch_order_or_chunks(linear20):
 def test_labels_of_a_tabular_model_do_not_depend_on_the_batch():
     belief = torch.rand(40, 1, generator=torch.Generator().manual_seed(0))
     y = TensorDict({"belief": torch.cat([belief, 1 - belief], -1)}, [40])
-    policy = RolloutPolicy(tiger(), ListenThenOpen(0.9), trajectories=3, max_steps=80)
+    policy = RolloutPolicy(tiger().model, ListenThenOpen(0.9), trajectories=3, max_steps=80)
     reference = policy.q_factors(y)
     assert torch.equal(torch.cat([policy.q_factors(part) for part in y.split(7)]), reference)
 
@@ -119,7 +113,7 @@ def test_both_kinds_of_leaves_estimate_the_same_q_factors():
 
 def test_q_factors_with_exact_leaves_equal_bellman_by_hand():
     """Opening a door forgets everything, so a base policy that opens one leaves no sampling in equation (1) for m = 1."""
-    model = tiger()
+    model = tiger().model
     y = TensorDict({"belief": torch.tensor([[0.5, 0.5], [0.9, 0.1]])}, [2])
 
     def open_left(y):
@@ -156,7 +150,7 @@ def test_a_rolled_out_first_control_is_really_applied():
 
 
 def test_rollout_improves_tiger_and_stays_above_the_optimum():
-    model = tiger()
+    model = tiger().model
     y = FixedBelief(torch.tensor([0.5, 0.5]))(torch.arange(1))
     # Listening until 0.98 is one time too often.
     base = ListenThenOpen(0.98)

@@ -6,8 +6,10 @@ import pytest
 import torch
 from _oracles import LINE3_OPTIMUM, Memo, line3_cost, random_states, small_model
 
-from torchrl_pomdp.envs import line, tiger
-from torchrl_pomdp.modules import AfterSteps, GreedyRepair, MultistepLookahead, RolloutPolicy, SteadyStateCost
+from torchrl_pomdp.envs.repair import line
+from torchrl_pomdp.modules import AfterSteps, MultistepLookahead, RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair, SteadyStateCost
+from torchrl_pomdp.problems import tiger
 
 
 def recursion(model, y, depth):
@@ -104,7 +106,7 @@ def test_drawn_branches_are_right_on_average():
 
 
 def test_tiger_listens_until_it_knows():
-    model = tiger()
+    model = tiger().model
 
     def listen(y):
         return y.set("action", torch.zeros(y.batch_size, dtype=torch.int64))

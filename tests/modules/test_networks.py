@@ -4,18 +4,10 @@ import pytest
 import torch
 from _oracles import random_states, small_model
 
-from torchrl_pomdp.envs import grid, line, tiger
-from torchrl_pomdp.modules import (
-    FlatEncoder,
-    GreedyRepair,
-    NeverRepairCost,
-    PartitionedPolicy,
-    PartitionedValue,
-    PolicyNetwork,
-    RelativeEncoder,
-    SteadyStateCost,
-    ValueNetwork,
-)
+from torchrl_pomdp.envs.repair import grid, line
+from torchrl_pomdp.modules import FlatEncoder, PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, SteadyStateCost
+from torchrl_pomdp.problems import tiger
 
 
 def network(model, seed=0, encoder=FlatEncoder):
@@ -27,7 +19,7 @@ def test_flat_encoding_holds_beliefs_and_one_hot_location(linear20):
     features = FlatEncoder(linear20.model)(y)
     torch.testing.assert_close(features[:, :100].view(4, 20, 5), y["belief"])
     assert torch.equal(features[:, 100:].argmax(-1), y["location"][:, 0])
-    assert FlatEncoder(tiger()).num_features == 2
+    assert FlatEncoder(tiger().model).num_features == 2
 
 
 def test_relative_encoding_by_hand():

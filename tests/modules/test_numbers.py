@@ -10,25 +10,25 @@ from _oracles import random_states, small_model
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_pomdp.envs import CalibratedStart, FixedBelief, RepairModel, TabularModel, UniformStart, damage_chain, line, tiger
+from torchrl_pomdp.envs import FixedBelief, TabularModel
+from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, UniformStart, damage_chain, line
 from torchrl_pomdp.evaluation import discounted_costs
 from torchrl_pomdp.modules import (
     AfterSteps,
     FlatEncoder,
-    GreedyRepair,
     MultistepLookahead,
-    NeverRepairCost,
     OnEntering,
     ParallelRollout,
     PartitionedPolicy,
     PartitionedValue,
     PolicyCost,
     PolicyNetwork,
-    RelativeEncoder,
     RolloutPolicy,
     TruncatedRollout,
     ValueNetwork,
 )
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder
+from torchrl_pomdp.problems import tiger
 
 BROKEN = [math.nan, math.inf, -math.inf]
 # In which of the states that are met.
@@ -207,7 +207,7 @@ class NothingAllowed(TabularModel):
 
 
 def test_a_state_without_a_legal_control_is_refused():
-    known = tiger()
+    known = tiger().model
     model = NothingAllowed(known.transition, known.observation, known.cost, known.discount)
     y = TensorDict({"belief": torch.tensor([[0.5, 0.5], [1.0, 0.0]])}, [2])
 
@@ -232,7 +232,7 @@ def test_beliefs_that_are_no_numbers_are_refused(linear20):
         with pytest.raises(ValueError, match="'belief' of y"):
             user(y.clone())
     with pytest.raises(ValueError, match="belief"):
-        discounted_costs(tiger(), lambda y: y, FixedBelief(torch.tensor([math.nan, 1.0])), num_states=1)
+        discounted_costs(tiger().model, lambda y: y, FixedBelief(torch.tensor([math.nan, 1.0])), num_states=1)
 
 
 def test_the_chosen_control_is_the_cheapest_legal_one():

@@ -4,8 +4,9 @@ import pytest
 import torch
 from _oracles import LINE3_OPTIMUM, Memo, line3_cost
 
-from torchrl_pomdp.envs import make_problem
-from torchrl_pomdp.modules import GreedyRepair, ParallelRollout, RolloutPolicy, UrgencyRepair
+from torchrl_pomdp.modules import ParallelRollout, RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.problems import make_problem
 
 
 def test_q_factors_are_the_smallest_over_the_bases(linear20):

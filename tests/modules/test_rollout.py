@@ -7,18 +7,12 @@ import torch
 from _oracles import COSTS, LINE3_OPTIMUM, LINE3_OPTIMUM_BY_START_LEVEL, Memo, line3_cost
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import (
-    CalibratedStart,
-    RepairModel,
-    UniformStart,
-    damage_chain,
-    grid,
-    line,
-    tiger,
-)
+from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, UniformStart, damage_chain, grid, line
 from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
-from torchrl_pomdp.modules import GreedyRepair, NeverRepairCost, RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.modules import RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
 from torchrl_pomdp.noise import fold, seed_keys
+from torchrl_pomdp.problems import tiger
 
 
 def test_greedy_on_the_line_of_3_exactly_and_simulated(line3):
@@ -130,7 +124,7 @@ def always(model, control):
 
 
 def test_a_cut_rollout_adds_the_discounted_terminal_cost():
-    model = tiger()
+    model = tiger().model
     y = TensorDict({"belief": torch.tensor([[0.3, 0.7]])}, [1])
     rollout = TruncatedRollout(model, always(model, 0), max_steps=3, terminal_cost=lambda y: y["belief"].sum(-1) * 50)
     expected = 1 + 0.95 + 0.95**2 + 0.95**3 * 50
@@ -147,7 +141,7 @@ def test_terminal_states_cost_nothing_not_even_the_terminal_cost(line3):
 
 
 def test_listening_forever_has_its_closed_form_cost():
-    model = tiger()
+    model = tiger().model
     y = TensorDict({"belief": torch.full((5, 2), 0.5)}, [5])
     cost = TruncatedRollout(model, always(model, 0))(y, torch.arange(5))
     torch.testing.assert_close(cost, torch.full((5,), 1 / (1 - 0.95)), rtol=1e-5, atol=0)

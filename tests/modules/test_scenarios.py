@@ -8,10 +8,12 @@ import statistics
 import pytest
 import torch
 
-from torchrl_pomdp.envs import RepairModel, UniformStart, damage_chain, line, make_problem
-from torchrl_pomdp.modules import GreedyRepair, NeverRepairCost, PolicyCost, RolloutPolicy
+from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, line
+from torchrl_pomdp.modules import PolicyCost, RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.noise import fold, permuted
+from torchrl_pomdp.problems import make_problem
 
 
 def group(states, count, seed=0):

@@ -9,18 +9,10 @@ import torch
 from _oracles import exact_cost, random_states, small_model
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import RepairModel, damage_chain, line, tiger
-from torchrl_pomdp.modules import (
-    AfterSteps,
-    GreedyRepair,
-    NeverRepairCost,
-    OnEntering,
-    PolicyCost,
-    RolloutPolicy,
-    SteadyStateCost,
-    TruncatedRollout,
-    ZeroCost,
-)
+from torchrl_pomdp.envs.repair import RepairModel, damage_chain, line
+from torchrl_pomdp.modules import AfterSteps, OnEntering, PolicyCost, RolloutPolicy, TruncatedRollout, ZeroCost
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, SteadyStateCost
+from torchrl_pomdp.problems import tiger
 
 CHAINS = [(0.0, 0.3, 0.1), (0.2, 0.3, 0.1), (0.0, 1.0, 0.0)]
 
@@ -64,7 +56,7 @@ def test_the_present_cost_forever_is_exact_where_nothing_changes():
 def test_zero_is_zero_for_any_model_and_the_cut_rollout_is_the_sum_of_its_stage_costs():
     y = TensorDict({"belief": torch.full((5, 2), 0.5)}, [5])
     listen = TruncatedRollout(
-        tiger(),
+        tiger().model,
         lambda y: y.set("action", torch.zeros(y.batch_size, dtype=torch.int64)),
         truncation=AfterSteps(2),
         terminal_cost=ZeroCost(),

@@ -11,11 +11,14 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_pomdp.envs import RepairModel, RepairPartition, TabularModel, damage_chain, line, tiger
-from torchrl_pomdp.envs.belief import take_rows
+from torchrl_pomdp.envs import TabularModel
 from torchrl_pomdp.envs.partition import Partition
-from torchrl_pomdp.modules import AfterSteps, GreedyRepair, OnEntering, OnLeaving, RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.envs.repair import RepairModel, RepairPartition, damage_chain, line
+from torchrl_pomdp.envs.rows import take_rows
+from torchrl_pomdp.modules import AfterSteps, OnEntering, OnLeaving, RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.modules.scenarios import Scenarios
+from torchrl_pomdp.problems import tiger
 
 
 class MostLikely(Partition):
@@ -301,7 +304,7 @@ def test_bad_rules_are_refused(linear20):
     with pytest.raises(ValueError, match=r"parts must be in 0\.\.5, got \(3, 6\)"):
         TruncatedRollout(model, greedy, truncation=AfterSteps(3) | OnEntering((3, 6)), terminal_cost=damage)
     with pytest.raises(ValueError, match=r"OnLeaving reads \['partition'\]"):
-        TruncatedRollout(tiger(), only, truncation=OnLeaving() | AfterSteps(3), terminal_cost=hundred)
+        TruncatedRollout(tiger().model, only, truncation=OnLeaving() | AfterSteps(3), terminal_cost=hundred)
     with pytest.raises(TypeError):
         AfterSteps(3) | 4
 

@@ -8,18 +8,9 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_pomdp.envs import RandomState, RepairModel, damage_chain, line
-from torchrl_pomdp.modules import (
-    FlatEncoder,
-    GreedyRepair,
-    NeverRepairCost,
-    PolicyCost,
-    PolicyNetwork,
-    RolloutPolicy,
-    SteadyStateCost,
-    ValueNetwork,
-    ZeroCost,
-)
+from torchrl_pomdp.envs.repair import RandomState, RepairModel, damage_chain, line
+from torchrl_pomdp.modules import FlatEncoder, PolicyCost, PolicyNetwork, RolloutPolicy, ValueNetwork, ZeroCost
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, SteadyStateCost
 from torchrl_pomdp.objectives import ClassificationLoss, ValueLoss
 from torchrl_pomdp.trainers import PolicyIterationConfig, train_part
 

@@ -11,17 +11,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchrl_pomdp.envs import CalibratedStart, RepairModel, damage_chain, line, make_problem
+from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, damage_chain, line
 from torchrl_pomdp.files import DamagedFileError, load_tensors, save_tensors
 from torchrl_pomdp.identity import digest
-from torchrl_pomdp.modules import (
-    GreedyRepair,
-    NeverRepairCost,
-    PartitionedPolicy,
-    PartitionedValue,
-    SteadyStateCost,
-    UrgencyRepair,
-)
+from torchrl_pomdp.modules import FlatEncoder, PartitionedPolicy, PartitionedValue
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, SteadyStateCost, UrgencyRepair
+from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import (
     Checkpoint,
     PolicyIterationConfig,
@@ -51,7 +46,7 @@ def path(tmp_path):
 
 
 def same(one, other):
-    assert (one.problem.name, one.problem.partitioned) == (other.problem.name, other.problem.partitioned)
+    assert (one.problem.name, one.problem.spec) == (other.problem.name, other.problem.spec)
     assert (one.config, one.algorithm, one.iteration) == (other.config, other.algorithm, other.iteration)
     mine, theirs = ([*c.policy.policies, *c.value.values] for c in (one, other))
     return digest(mine) == digest(theirs)
@@ -69,7 +64,7 @@ def redigested(content):
 
 
 @pytest.mark.parametrize("partitioned", [True, False])
-@pytest.mark.parametrize("encoder", ["flat", "relative"])
+@pytest.mark.parametrize("encoder", ["flat", "own"])
 def test_restores_policy_values_partition_problem_and_configuration(path, partitioned, encoder):
     problem, config = make_problem("line3", partitioned=partitioned), replace(CONFIG, encoder=encoder)
     policy, value = networks(problem, config)
@@ -129,12 +124,16 @@ def test_a_problem_is_told_by_its_content(line3, path):
         ),
         replace(line3, start=CalibratedStart(model)),
         replace(line3, training=line3.training[::-1]),
-        replace(line3, partitioned=False),
+        replace(line3, encoder=FlatEncoder),
+        replace(line3, symmetries=line3.symmetries[:1]),
+        replace(line3, pessimistic_cost=SteadyStateCost(model)),
     ]
     for other in others:
-        with pytest.raises(ValueError, match=r"checkpoint.problem must be the preset line3, got another problem of that name"):
+        with pytest.raises(
+            ValueError, match=r"checkpoint.problem must be what its spec describes, got another problem 'line3'"
+        ):
             save_checkpoint(path, Checkpoint(other, CONFIG, "pAPI-NT", 1, policy, value))
-    with pytest.raises(ValueError, match=r"checkpoint.problem must be one of grid5x4, .*, got 'mine'"):
+    with pytest.raises(ValueError, match=r"checkpoint.problem must be what its spec describes, got another problem 'mine'"):
         save_checkpoint(path, Checkpoint(replace(line3, name="mine"), CONFIG, "pAPI-NT", 1, policy, value))
     assert not path.exists()
     save_checkpoint(path, Checkpoint(line3, CONFIG, "pAPI-NT", 1, policy, value))
@@ -245,7 +244,7 @@ def test_damaged_and_foreign_files_are_refused_by_name(path, small):
     [
         {"iteration": "x"}, {"iteration": ["x"]}, {"iteration": -1}, {"iteration": True}, {"iteration": 1.5},
         {"algorithm": "\x1b[2Jgone"}, {"algorithm": None}, {"problem": "grid5x4"}, {"problem": "line4"}, {"problem": ["line3"]},
-        {"partitioned": 1}, {"partitioned": True}, {"config": {"hidden": [8], "nonsense": 1}}, {"config": []},
+        {"spec": {"preset": "line3"}}, {"spec": {"preset": "line3", "partitioned": 1}}, {"spec": 3}, {"spec": {}}, {"config": {"hidden": [8], "nonsense": 1}}, {"config": []},
         {"config": {"hidden": [9]}}, {"config": {"seed": -1}}, {"config": {"learning_rate": float("nan")}},
         {"value_parts": [0, 0]}, {"value_parts": [5]}, {"value_parts": 0}, {"value_parts": []}, {"value_parts": ["0"]},
         {"base": "greedy"}, {"base": {"name": "lazy", "digest": ""}}, {"base": {}}, {"format": "torchrl_pomdp policy 2"},
@@ -269,7 +268,9 @@ def test_every_entry_is_needed(path, small, entry):
         load_checkpoint(path)
 
 
-@pytest.mark.parametrize("name", ["algorithm", "iteration", "config", "problem", "base", "value_parts", "problem_digest"])
+@pytest.mark.parametrize(
+    "name", ["algorithm", "iteration", "config", "problem", "base", "value_parts", "problem_digest", "spec"]
+)
 def test_every_line_of_the_description_is_needed(path, small, name):
     save_checkpoint(path, small)
     content = load_tensors(path)

@@ -11,11 +11,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchrl_pomdp.envs import (
+from torchrl_pomdp.envs import InPart, Mixture
+from torchrl_pomdp.envs.repair import (
     CalibratedStart,
-    InPart,
-    Mixture,
-    Problem,
     RandomState,
     RepairModel,
     RepairPartition,
@@ -23,9 +21,10 @@ from torchrl_pomdp.envs import (
     damage_chain,
     grid,
     line,
-    make_problem,
 )
-from torchrl_pomdp.modules import AfterSteps, GreedyRepair, OnEntering, OnLeaving, UrgencyRepair
+from torchrl_pomdp.modules import AfterSteps, OnEntering, OnLeaving
+from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.problems import Problem, make_problem
 from torchrl_pomdp.trainers import Evaluate, Improve, PolicyIteration, PolicyIterationConfig
 from torchrl_pomdp.trainers import policy_iteration as module
 
@@ -63,7 +62,8 @@ def problem(**change):
         dtype=given["dtype"],
     )
     random = RandomState(model, given["fractions"])
-    return Problem("mine", model, given["start"](model), tuple(InPart(model, random, part) for part in range(6)))
+    training = tuple(InPart(model, random, part) for part in range(6))
+    return Problem(model, given["start"](model), name="mine", training=training)
 
 
 PLAN = [Evaluate((4,)), Improve((0, 4), OnEntering((3, 5)))]
@@ -206,7 +206,7 @@ SCRIPT = """
 import json, sys
 sys.path[:0] = [{tests!r}, {here!r}]
 from test_identity import AfterSteps, Improve, OnEntering, in_endgame, iteration, make_problem
-from torchrl_pomdp.modules import UrgencyRepair
+from torchrl_pomdp.modules.repair import UrgencyRepair
 plan = [Improve((0,), AfterSteps(in_endgame(3))), Improve((1,), OnEntering((3, 4, 5)))]
 runs = [iteration(None, plan=plan), iteration(None, make_problem("line3"), base=UrgencyRepair)]
 print(json.dumps([run._identity() for run in runs]))

@@ -10,33 +10,21 @@ import torch
 from torchrl.trainers import Trainer
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
-from torchrl_pomdp.envs import (
-    BeliefEnv,
-    InPart,
-    Problem,
-    RandomState,
-    RepairModel,
-    RepairPartition,
-    UniformStart,
-    damage_chain,
-    line,
-    make_problem,
-)
+from torchrl_pomdp.envs import BeliefEnv, InPart
+from torchrl_pomdp.envs.repair import RandomState, RepairModel, RepairPartition, UniformStart, damage_chain, line
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import (
-    GreedyRepair,
-    NeverRepairCost,
     OnEntering,
     PartitionedPolicy,
     PolicyCost,
     PolicyNetwork,
     RolloutPolicy,
-    SteadyStateCost,
-    UrgencyRepair,
     ValueNetwork,
     ZeroCost,
 )
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, SteadyStateCost, UrgencyRepair
 from torchrl_pomdp.objectives import ClassificationLoss
+from torchrl_pomdp.problems import Problem, make_problem
 from torchrl_pomdp.trainers import (
     Evaluate,
     Improve,
@@ -354,7 +342,7 @@ def test_labels_of_an_interrupted_run_are_not_made_again(line3, tmp_path, monkey
 
 def test_the_algorithms_refuse_partitions_that_do_not_fit(line3):
     greedy = GreedyRepair(line3.model)
-    with pytest.raises(ValueError, match="a single part, 'line3' has 6: make it with partitioned=False"):
+    with pytest.raises(ValueError, match="a single part, 'line3' has 6: take problem.unpartitioned"):
         api(line3, TINY, greedy)
     with pytest.raises(ValueError, match="at least two stages, problem 'line3' has 1"):
         papi_t(make_problem("line3", partitioned=False), TINY, greedy)
@@ -400,7 +388,7 @@ def test_states_where_nothing_is_to_be_paid_spoil_no_network():
     partition = RepairPartition(line(3), torch.tensor((0.0, 1.0, 5.0)))
     model = RepairModel(line(3), damage_chain((0.0, 0.0)), (0.0, 0.0, 5.0), 0.9, partition=partition)
     training = tuple(InPart(model, RandomState(model), part) for part in range(6))
-    problem = Problem("free", model, UniformStart(model), training)
+    problem = Problem(model, UniformStart(model), training=training, pessimistic_cost=NeverRepairCost(model))
     scale = NeverRepairCost(model).costs(torch.cat([states(torch.arange(50)) for states in training]))
     assert 0 < int((scale == 0).sum()) < 300
     (iteration,) = run(problem, replace(TINY, samples_per_part=60, value_samples=60), papi_t)
@@ -410,7 +398,9 @@ def test_states_where_nothing_is_to_be_paid_spoil_no_network():
     assert math.isfinite(iteration.comparison.difference.mean)
 
 
-def test_models_without_a_partition_are_refused():
+def test_a_model_without_a_partition_has_a_single_part():
     model = RepairModel(line(3), damage_chain((0.0, 0.02)), (0.0, 1.0, 2.0), 0.99)
-    with pytest.raises(ValueError, match="has no partition"):
-        papi_nt(Problem("bare", model, UniformStart(model), ()), TINY, GreedyRepair(model))
+    problem = Problem(model, UniformStart(model))
+    assert problem.partition.names == ("all",)
+    assert model.partition is None, "the user's own model is left alone"
+    assert [step.parts for step in papi_nt(problem, TINY, GreedyRepair(model)).plan] == [(0,)]

@@ -12,7 +12,8 @@ import torch
 
 from torchrl_pomdp import kept as kept_results
 from torchrl_pomdp.files import load_tensors, save_tensors
-from torchrl_pomdp.modules import UrgencyRepair
+from torchrl_pomdp.modules.repair import UrgencyRepair
+from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import PolicyIterationConfig, load_checkpoint, parts, policy_iteration
 from torchrl_pomdp.trainers import run as module
 from torchrl_pomdp.trainers.checkpoint import open_run_folder
@@ -32,7 +33,7 @@ TINY = PolicyIterationConfig(
     visits_per_label=0.2,
     validation_states=10,
 )
-RUN = TrainingRun("line3", "API", config=TINY, states=8, online_states=4, online_trajectories=1)
+RUN = TrainingRun(make_problem("line3"), "API", config=TINY, states=8, online_states=4, online_trajectories=1)
 
 
 class Killed(BaseException):
@@ -187,9 +188,9 @@ def test_a_folder_belongs_to_a_version_a_problem_and_base_policies(whole, tmp_pa
     with pytest.raises(ValueError, match="differs in problem_digest"):
         RUN.carry_out(whole[0])
     monkeypatch.undo()
-    monkeypatch.setitem(module.BASE_POLICIES, "urgency", lambda model: UrgencyRepair(model, 2.0))
+    bases = RUN.problem.base_policies | {"urgency": UrgencyRepair(RUN.problem.model, 2.0)}
     with pytest.raises(ValueError, match="differs in base_policies"):
-        RUN.carry_out(whole[0])
+        replace(RUN, problem=replace(RUN.problem, base_policies=bases)).carry_out(whole[0])
 
 
 def test_without_an_accepted_iteration_the_base_policy_is_best(tmp_path, line3):
@@ -245,7 +246,7 @@ def test_numbers_are_checked_when_they_are_given(change):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"), [({"folder": 3}, "folder must be a path"), ({"device": "nonsense"}, "device must be")]
+    ("options", "message"), [({"folder": 3}, "folder must be a path"), ({"progress": "x"}, "progress must be")]
 )
 def test_what_is_refused_leaves_nothing_behind(tmp_path, options, message):
     with pytest.raises((TypeError, ValueError), match=message):

@@ -10,7 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
-from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator, inverse_cdf, take_rows
+from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
+from torchrl_pomdp.envs.rows import inverse_cdf, take_rows
 from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, controls_of
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.noise import fold, uniform
@@ -41,8 +42,8 @@ class StateMemory:
         ValueError: if ``capacity`` is not positive or ``retain`` is not in (0, 1].
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("linear20")
         >>> memory = StateMemory(problem.model, capacity=100)
         >>> memory.visit(GreedyRepair(problem.model), problem.start, torch.arange(200))

@@ -26,8 +26,9 @@ class RolloutImprovement(LabelCollector):
     Examples:
         >>> import torch
         >>> from torchrl_pomdp.collectors import PartSampler
-        >>> from torchrl_pomdp.envs import BeliefEnv, make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.envs import BeliefEnv
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("linear20")
         >>> collector = RolloutImprovement(
         ...     BeliefEnv(problem.model, problem.start),

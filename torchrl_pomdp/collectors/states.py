@@ -9,10 +9,10 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number, shown
 from torchrl_pomdp.collectors.memory import StateMemory
-from torchrl_pomdp.envs.belief import StateGenerator
+from torchrl_pomdp.envs.belief_model import StateGenerator
 from torchrl_pomdp.envs.generators import Mixture, draw_each
-from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.noise import seed_keys
+from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.tensor_checks import check_keys
 
 __all__ = ["PartSampler", "StateSampler", "training_states"]
@@ -34,7 +34,7 @@ class PartSampler:
 
     Examples:
         >>> import torch
-        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.problems import make_problem
         >>> problem = make_problem("linear20")
         >>> sampler = PartSampler({part: problem.training[part] for part in (3, 4, 5)}, seed=0)
         >>> problem.model.partition(sampler(torch.arange(6))).tolist()
@@ -76,8 +76,8 @@ def training_states(problem: Problem, memory: StateMemory | None, part: int, *, 
 
     Examples:
         >>> import torch
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("linear20")
         >>> memory = StateMemory(problem.model)
         >>> memory.visit(GreedyRepair(problem.model), problem.start, torch.arange(50), exploration=0.15)

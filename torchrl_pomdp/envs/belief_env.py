@@ -10,7 +10,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_seed
-from torchrl_pomdp.envs.belief import BeliefModel, StateGenerator
+from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.legal import LegalControls
 
 __all__ = ["BeliefEnv"]
@@ -51,7 +51,7 @@ class BeliefEnv(EnvBase):
             ``reset`` if a given or generated state is none.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.problems import make_problem
         >>> problem = make_problem("linear20")
         >>> env = BeliefEnv(problem.model, problem.start, batch_size=(4,), seed=0)
         >>> env.rollout(3)["next", "reward"].shape

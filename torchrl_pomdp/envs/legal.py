@@ -23,7 +23,7 @@ from torchrl.data import Categorical, Composite, TensorSpec
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 from torchrl.modules import RandomPolicy
 
-from torchrl_pomdp.envs.belief import inverse_cdf
+from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.noise import fold
 
 __all__ = ["LegalControls"]

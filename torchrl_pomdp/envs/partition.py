@@ -1,4 +1,4 @@
-"""Partitions of the feature space (paper, Section V; for repair problems Section VI-B).
+"""Partitions of the feature space (paper, Section V).
 
 The index of the part that holds a feature state is itself a feature: ``y["partition"]``. Policies and values are
 routed by it, and training proceeds in stages of parts.
@@ -7,21 +7,16 @@ routed by it, and training proceeds in stages of parts.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_pomdp.checks import check_instance, check_integer, check_number, check_text, shown
-from torchrl_pomdp.envs.graphs import Graph
-from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.tensor_checks import check_device, check_entries, check_tensor
+from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_sequence, check_text, shown
+from torchrl_pomdp.tensor_checks import check_entries
 
-__all__ = ["Partition", "RepairPartition", "SinglePart"]
-
-# How many different columns a plan can have from its left to its right edge.
-_COLUMN_UNITS = 2.0**18
+__all__ = ["FunctionPartition", "Partition", "SinglePart"]
 
 
 class Partition(nn.Module, ABC):
@@ -83,103 +78,50 @@ class SinglePart(Partition):
         return torch.zeros(y.batch_size, dtype=torch.int64, device=y.device)
 
 
-class RepairPartition(Partition):
-    r"""The six parts of the pipeline problem (paper, Section VI-B).
-
-    *Phase*: a state is an endgame state if fewer than half of the locations are believed damaged, that is
-    :math:`1-b(0)>` ``damage_threshold``. With the threshold at zero and level 0 absorbing the count never grows, so
-    endgame states lead only to endgame states and the endgame parts are trained first.
-
-    *Density*: with LD and RD the expected costs left and right of the robot, LD/(LD+RD) above 0.7, in between, or below
-    0.3; LD+RD = 0 counts as balanced. "Left" is by column, for several robots relative to their mean column.
+class FunctionPartition(Partition):
+    r"""A partition that a function of feature states gives.
 
     Args:
-        graph: where the robots are; its columns define left and right.
-        costs: cost of each damage level, ``[K]``.
-        damage_threshold: probability of damage above which a location is believed damaged.
-        device: where the tables are.
+        names: one name for each part.
+        function: gives the number of the part of each feature state, int64 ``[*B]`` for states ``[*B]``.
+        stages: groups of parts in the order in which they are trained, those first that the others lead to; None: all parts
+            in one stage. :func:`~torchrl_pomdp.problems.check_partition` counts what breaks the order.
 
     Raises:
-        TypeError: if an argument is of the wrong kind.
-        ValueError: if ``costs`` are not finite and nonnegative or ``damage_threshold`` is not in [0, 1).
+        TypeError: if an argument is of the wrong kind; when called, if the function gives no int64 tensor.
+        ValueError: if there is no part or a part is not in exactly one stage; when called, if the function gives numbers of
+            another shape, or of no part.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> problem = make_problem("linear20")
-        >>> problem.model.partition.names[0], problem.model.partition.stages
-        ('startgame left', ((3, 4, 5), (0, 1, 2)))
+        >>> from tensordict import TensorDict
+        >>> sure = FunctionPartition(("unsure", "sure"), lambda y: (y["belief"].amax(-1) > 0.9).long(), stages=((1,), (0,)))
+        >>> sure(TensorDict({"belief": torch.tensor([[0.5, 0.5], [0.0, 1.0]])}, [2])).tolist()
+        [0, 1]
     """
 
-    names = (
-        "startgame left",
-        "startgame balanced",
-        "startgame right",
-        "endgame left",
-        "endgame balanced",
-        "endgame right",
-    )
-    stages = ((3, 4, 5), (0, 1, 2))
-    density_bounds = (0.3, 0.7)
-    columns: Tensor
-
     def __init__(
-        self, graph: Graph, costs: Tensor, *, damage_threshold: float = 0.0, device: torch.device | str = "cpu"
+        self,
+        names: Sequence[str],
+        function: Callable[[TensorDictBase], Tensor],
+        stages: Sequence[Sequence[int]] | None = None,
     ) -> None:
         super().__init__()
-        check_instance("graph", graph, Graph)
-        self.damage_threshold = check_number("damage_threshold", damage_threshold, "[0, 1)")
-        costs = check_tensor("costs", costs, (None,), finite=False)
-        if len(costs) < 2 or not bool((torch.isfinite(costs.float()) & (costs >= 0)).all()):
-            raise ValueError(f"costs must be finite and nonnegative for at least 2 levels, got {costs.tolist()}")
-        self._prices = tuple(costs.tolist())
-        # In units below which two columns count as equal: coordinates are rounded.
-        columns = graph.columns.double() - graph.columns.double().min()
-        columns = columns / (float(columns.max()) or 1.0) * _COLUMN_UNITS
-        self.register_buffer("columns", columns.float().to(check_device("device", device)), persistent=False)
-
-    def check_fits(self, num_locations: int, num_levels: int, device: torch.device) -> None:
-        """Raise unless this is a partition for so many locations and levels, on the same device."""
-        own = len(self.columns), len(self._prices)
-        if own != (num_locations, num_levels):
-            raise ValueError(
-                f"partition must be for {num_locations} locations and {num_levels} levels as the model is, "
-                f"got one for {own[0]} locations and {own[1]} levels"
-            )
-        if self.columns.device != device:
-            raise ValueError(f"partition must be on the model's device {device}, got one on {self.columns.device}")
+        self.names = tuple(check_sequence("names", names, str, 1))
+        self.function = check_callable("function", function)
+        groups = [range(len(self.names))] if stages is None else check_sequence("stages", stages, Sequence, 1)
+        self.stages = tuple(tuple(stage) for stage in groups)
+        self.check()
 
     def forward(self, y: TensorDictBase) -> Tensor:
-        """Part index int64 ``[*B]``: three times the phase (0 startgame, 1 endgame) plus the density class."""
-        check_entries("y", y, ("belief", "location"))
-        belief, location = y.get("belief"), y.get("location")
-        # A view [L, K, *B]: the model keeps the batch innermost.
-        planes = belief.movedim((-2, -1), (0, 1))
-        # floor is exact and, like all arithmetic, much faster than comparisons of this size.
-        num_intact = sum_first((planes[:, 0] + self.damage_threshold).floor())
-        endgame = 2 * num_intact > belief.shape[-2]
-        return 3 * endgame.to(torch.int64) + self._density(planes, location)
-
-    def _density(self, planes: Tensor, location: Tensor) -> Tensor:
-        """0 where the damage is mostly left, 1 where balanced, 2 where mostly right: int64 ``[*B]``."""
-        cost = location_costs(planes, self._prices)
-        column = self.columns.view(-1, *([1] * (cost.ndim - 1)))
-        # R times the robots' mean column.
-        centre = sum_first(self.columns[location].movedim(-1, 0).clone())
-        # At least 1 left of the robots, 0 at them, at most -1 right of them.
-        side = (centre - column * location.shape[-1]).trunc_()
-        left, right = sum_first(cost * side.clamp(0, 1)), sum_first(cost * side.neg_().clamp_(0, 1))
-        low, high = self.density_bounds
-        total = left + right
-        # Cross-multiplied, so that no damage on either side (total = 0) is balanced.
-        return 1 - (left > high * total).to(torch.int64) + (left < low * total).to(torch.int64)
-
-
-def location_costs(planes: Tensor, costs: Sequence[float]) -> Tensor:
-    """Expected cost of every location, ``[L, *B]``, for beliefs as planes ``[L, K, *B]`` and a cost for each level."""
-    paid = [level for level, cost in enumerate(costs) if cost != 0]
-    if not paid:
-        return torch.zeros_like(planes[:, 0])
-    total = planes[:, paid[0]] * costs[paid[0]]
-    for level in paid[1:]:
-        total.add_(planes[:, level], alpha=costs[level])
-    return total
+        """Part index of every feature state, int64 ``[*B]``."""
+        part = self.function(check_entries("y", y, ()))
+        if not isinstance(part, Tensor) or part.dtype != torch.int64:
+            given = part.dtype if isinstance(part, Tensor) else shown(part)
+            raise TypeError(f"function must give the numbers of parts as an int64 tensor, got {given}")
+        if part.shape != y.batch_size:
+            raise ValueError(f"function must give one part for each state, {tuple(y.batch_size)}, got {tuple(part.shape)}")
+        low, high = part.aminmax() if part.numel() else (0, 0)
+        if low < 0 or high >= len(self.names):
+            wrong = int(low if low < 0 else high)
+            raise ValueError(f"function must give parts in 0..{len(self.names) - 1}, got {wrong} among them")
+        return part

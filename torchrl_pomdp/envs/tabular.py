@@ -1,53 +1,80 @@
-"""Any finite POMDP as a belief model, from explicit arrays (paper, Section II)."""
+"""Any finite POMDP as a belief model, from explicit tables (paper, Section II)."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 
-from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf
+from torchrl_pomdp.checks import check_sequence, check_text, shown
+from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.envs.tables import table
 from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype, check_tensor
 
-__all__ = ["TabularModel", "tiger"]
-
-# States that are summed over at once: temporary tensors hold so many distributions for each row.
-_BLOCK = 16
+__all__ = ["TabularModel"]
 
 
 class TabularModel(BeliefModel):
-    r"""Belief model of a POMDP with n states, given by its arrays; all controls are legal everywhere.
+    r"""Belief model of a POMDP with n states, given by its tables.
 
-    The core entry is ``"belief"`` ``[*B, n]``.
+    The core entry is ``"belief"`` ``[*B, n]``. The *support* of a belief are the states of positive probability.
+
+    Tables may be dense, or sparse where most probabilities are zero: thousands of states then take no array of
+    ``[n, n]`` numbers. A control is legal at a belief if it is legal in every state of the support; the support of every belief
+    that can be met must leave a control, so states that share none must be told apart by what is observed.
 
     Args:
-        transition: :math:`p_{ij}(u)`, ``[U, n, n]``, rows sum to one.
-        observation: :math:`p(z\mid j,u)`, ``[U, n, Z]`` by next state j, rows sum to one.
-        cost: expected stage cost :math:`\sum_j p_{ij}(u)g(i,u,j)`, ``[n, U]``; negative costs are rewards.
+        transition: :math:`p_{ij}(u)`, ``[U, n, n]``, rows sum to one; dense, or a sparse tensor in COO layout.
+        observation: :math:`p(z\mid j,u)`, ``[U, n, Z]`` by next state j, rows sum to one; dense or sparse likewise.
+        cost: stage costs; negative costs are rewards. By state :math:`g(i,u)`, ``[U, n]``, by next state too
+            :math:`g(i,u,j)`, ``[U, n, n]``, or by observation too :math:`g(i,u,j,z)`, ``[U, n, n, Z]``; what is kept is the
+            expected cost ``[U, n]``.
         discount: :math:`\alpha`.
 
     Keyword Args:
+        legal: bool ``[n, U]``, the controls that are legal in each state, at least one; None: all. Tables hold
+            distributions and finite costs at illegal ones too.
+        terminal: bool ``[n]``, states that are never left and from which no cost follows; None: none.
+        state_names: names of the states.
+        control_names: names of the controls.
+        observation_names: names of the observations.
         partition: partition whose index becomes a feature.
         dtype: float32 or float64.
         device: where the model computes.
 
+    Attributes:
+        cost: expected stage cost :math:`\sum_j p_{ij}(u)\,g(i,u,j)`, ``[U, n]``.
+        num_states: n.
+
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if an array has the wrong shape or rows that are no distributions, or a cost is not finite in ``dtype``.
+        ValueError: if a table has the wrong shape or rows that are no distributions, a cost is not finite in ``dtype``, a state
+            has no legal control, a terminal state can be left or costs something, or names are not one for each, all different.
 
     Examples:
-        >>> model = tiger()
-        >>> model.describe()
-        'TabularModel: 3 controls, 2 observations, discount 0.95'
+        A machine that works or is broken, where only a broken one can be repaired:
+
+        >>> from tensordict import TensorDict
+        >>> wear, repair = [[0.9, 0.1], [0.0, 1.0]], [[1.0, 0.0], [1.0, 0.0]]
+        >>> seen = torch.eye(2).expand(2, 2, 2)
+        >>> legal = torch.tensor([[True, False], [True, True]])
+        >>> model = TabularModel([wear, repair], seen, [[0.0, 5.0], [0.0, 8.0]], 0.9, legal=legal)
+        >>> model.with_features(TensorDict({"belief": torch.tensor([[1.0, 0.0], [0.0, 1.0]])}, [2]))["action_mask"].tolist()
+        [[True, False], [True, True]]
     """
 
     state_keys = ("belief",)
-    transition: Tensor
-    observation: Tensor
+    state_names: tuple[str, ...] | None
     cost: Tensor
+    illegal: Tensor | None
+    going: Tensor | None
 
     def __init__(
         self,
@@ -56,63 +83,142 @@ class TabularModel(BeliefModel):
         cost: Tensor,
         discount: float,
         *,
+        legal: Tensor | None = None,
+        terminal: Tensor | None = None,
+        state_names: Sequence[str] | None = None,
+        control_names: Sequence[str] | None = None,
+        observation_names: Sequence[str] | None = None,
         partition: Partition | None = None,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(discount, partition)
         dtype, device = check_dtype("dtype", dtype), check_device("device", device)
-        transition = check_tensor("transition", transition, finite=False)
-        observation = check_tensor("observation", observation, finite=False)
-        cost = check_tensor("cost", cost, finite=False)
-        if transition.ndim != 3 or transition.shape[1] != transition.shape[2] or not transition.numel():
-            raise ValueError(f"transition must have shape [U, n, n], at least one of each, got {tuple(transition.shape)}")
-        self.num_controls, self.num_states, _ = transition.shape
-        if observation.ndim != 3 or observation.shape[:2] != transition.shape[:2] or not observation.numel():
-            raise ValueError(
-                f"observation must have shape [{self.num_controls}, {self.num_states}, Z], got {tuple(observation.shape)}"
-            )
-        self.num_observations = observation.shape[-1]
-        cost = cost.to(dtype)
-        if cost.shape != (self.num_states, self.num_controls) or not bool(torch.isfinite(cost).all()):
-            shape = f"[{self.num_states}, {self.num_controls}]"
-            raise ValueError(f"cost must be finite of shape {shape} as {dtype}, got {tuple(cost.shape)}")
-        tables = {"transition": _rows("transition", transition), "observation": _rows("observation", observation), "cost": cost}
-        for name, array in tables.items():
-            self.register_buffer(name, array.to(device, dtype), persistent=False)
+        self._moves = table("transition", transition, dtype, device)
+        self.num_controls, self.num_states, _ = self._moves.shape
+        self._sees = table("observation", observation, dtype, device, self._moves.shape[:2])
+        self.num_observations = self._sees.shape[-1]
+        expected = self._expected(check_tensor("cost", cost, finite=False), dtype)
+        self.register_buffer("cost", expected.to(device), persistent=False)
+        self._register_legal(legal)
+        self._register_terminal(terminal)
+        self.state_names = _names("state_names", state_names, self.num_states)
+        self.control_names = _names("control_names", control_names, self.num_controls)
+        self.observation_names = _names("observation_names", observation_names, self.num_observations)
+        allowed = self.cost if self.illegal is None else self.cost.masked_fill(self.illegal.T.bool(), 0.0)
+        self.max_cost = float(allowed.abs().max())
+
+    def _expected(self, cost: Tensor, dtype: torch.dtype) -> Tensor:
+        """The expected stage costs ``[U, n]`` on the CPU."""
+        num_controls, n, num_observations = self.num_controls, self.num_states, self.num_observations
+        shapes = [(num_controls, n, n, num_observations)[:dims] for dims in (2, 3, 4)]
+        cost = cost.detach().cpu().to(dtype)
+        if tuple(cost.shape) not in shapes or not bool(torch.isfinite(cost).all()):
+            allowed = ", ".join(str(list(shape)) for shape in shapes)
+            raise ValueError(f"cost must be finite as {dtype}, of one of the shapes {allowed}, got {tuple(cost.shape)}")
+        if cost.ndim == 2:
+            return cost
+        result = torch.zeros(num_controls, n, dtype=torch.float64)
+        for u in range(num_controls):
+            i, j, prob = (part.cpu() for part in self._moves.entries(u))
+            by_next = cost[u].double()
+            if cost.ndim == 4:
+                state, z, seen = (part.cpu() for part in self._sees.entries(u))
+                by_next = torch.zeros(n, n, dtype=torch.float64).index_add_(1, state, by_next[:, state, z] * seen)
+            result[u].index_add_(0, i, by_next[i, j] * prob)
+        return result.to(dtype)
+
+    def _register_legal(self, legal: Any) -> None:
+        illegal = None
+        if legal is not None:
+            legal = check_tensor("legal", legal, (self.num_states, self.num_controls), torch.bool, finite=False)
+            stuck = (~legal.any(1)).nonzero()
+            if len(stuck):
+                raise ValueError(f"legal must allow at least one control in every state, got none in state {int(stuck[0])}")
+            illegal = None if bool(legal.all()) else (~legal).to(self.device, torch.float32)
+        self.register_buffer("illegal", illegal, persistent=False)
+
+    def _register_terminal(self, terminal: Any) -> None:
+        going = None
+        if terminal is not None:
+            terminal = check_tensor("terminal", terminal, (self.num_states,), torch.bool, finite=False).to(self.device)
+            legal = torch.ones_like(self.cost, dtype=torch.bool) if self.illegal is None else self.illegal.T == 0
+            wrong = (legal & terminal & ((self._moves.diagonal() < 1.0) | (self.cost != 0.0))).nonzero()
+            if len(wrong):
+                u, state = wrong[0].tolist()
+                raise ValueError(
+                    f"terminal states must stay what they are at no cost, got state {state} where control {u} does something"
+                )
+            going = (~terminal).to(self.dtype) if bool(terminal.any()) else None
+        self.register_buffer("going", going, persistent=False)
+
+    @property
+    def transition(self) -> Tensor:
+        r""":math:`p_{ij}(u)`, ``[U, n, n]``, dense or sparse as it was given."""
+        return self._moves.given()
+
+    @property
+    def observation(self) -> Tensor:
+        r""":math:`p(z\mid j,u)`, ``[U, n, Z]``, dense or sparse as it was given."""
+        return self._sees.given()
+
+    @property
+    def legal(self) -> Tensor:
+        """Controls that are legal in each state, bool ``[n, U]``."""
+        return torch.ones_like(self.cost.T, dtype=torch.bool) if self.illegal is None else self.illegal == 0
+
+    @property
+    def terminal(self) -> Tensor:
+        """States that are terminal, bool ``[n]``."""
+        return torch.zeros_like(self.cost[0], dtype=torch.bool) if self.going is None else self.going == 0
 
     @property
     def device(self) -> torch.device:
         """Device of the model's tensors."""
-        return self.transition.device
+        return self.cost.device
 
     @property
     def dtype(self) -> torch.dtype:
         """Type of beliefs and costs."""
-        return self.transition.dtype
+        return self.cost.dtype
 
     def state_spec(self, batch_size: torch.Size | tuple[int, ...] = ()) -> Composite:
         """``belief`` ``[*B, n]`` in [0, 1]."""
         shape = torch.Size(batch_size)
-        belief = Bounded(0.0, 1.0, shape=(*shape, self.num_states), dtype=self.cost.dtype, device=self.device)
+        belief = Bounded(0.0, 1.0, shape=(*shape, self.num_states), dtype=self.dtype, device=self.device)
         return Composite(belief=belief, shape=shape, device=self.device)
 
     def check_state(self, y: TensorDictBase) -> None:
-        """Raise unless ``y`` is a feature state; see :meth:`BeliefModel.check_state`. Beliefs must sum to one."""
+        """Raise unless ``y`` is a feature state; see :meth:`BeliefModel.check_state`.
+
+        Beliefs must sum to one, and their support must leave a legal control.
+        """
         super().check_state(y)
         check_distributions("entry 'belief' of y", y.get("belief"))
+        if self.illegal is not None:
+            stuck = (~self.action_mask(y).any(-1)).nonzero()
+            if len(stuck):
+                where = tuple(stuck[0].tolist())
+                raise ValueError(f"entry 'belief' of y at batch index {where} has states that share no legal control")
 
     def action_mask(self, y: TensorDictBase) -> Tensor:
-        """All True, ``[*B, U]``."""
-        return torch.ones(*y.batch_size, self.num_controls, dtype=torch.bool, device=self.device)
+        """Controls that are legal in every state of the support, bool ``[*B, U]``."""
+        if self.illegal is None:
+            return torch.ones(*y.batch_size, self.num_controls, dtype=torch.bool, device=self.device)
+        # Small whole numbers, which a product of matrices adds without rounding.
+        return (y.get("belief") > 0).to(torch.float32) @ self.illegal == 0
+
+    def is_terminal(self, y: TensorDictBase) -> Tensor:
+        """Bool ``[*B]``: whether all states of the support are terminal."""
+        return super().is_terminal(y) if self.going is None else ~(y.get("belief") * self.going > 0).any(-1)
 
     def expected_cost(self, y: TensorDictBase, u: Tensor) -> Tensor:
         r""":math:`\sum_i b(i)\,g(i,u)`, ``[*B]``."""
-        return sum_first(self.cost[:, u].mul_(y.get("belief").movedim(-1, 0)))
+        return sum_first(self.cost[u].mul_(y.get("belief")).movedim(-1, 0))
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
         r""":math:`\hat p(z\mid b,u)`, ``[*B, Z]``."""
-        return self._observed(self._predicted(y, u), u.reshape(-1)).view(*y.batch_size, -1)
+        return self._sees.mix(self._predicted(y, u), u.reshape(-1)).view(*y.batch_size, -1)
 
     def estimator(self, y: TensorDictBase, u: Tensor, z: Tensor) -> TensorDictBase:
         """F(y, u, z) by Bayes' rule.
@@ -122,79 +228,35 @@ class TabularModel(BeliefModel):
         """
         self.check_controls(y, u)
         self.check_observations(y, z)
-        predicted = self._predicted(y, u)
-        weight, total = self._weigh(predicted, u.reshape(-1), z.reshape(-1))
+        weight, total = self._weigh(self._predicted(y, u), u.reshape(-1), z.reshape(-1))
         self._refuse_impossible(z, (total > 0).view(y.batch_size))
         return self._successor(y, weight, total)
 
     def advance(self, y: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase]:
         """One sampled step, see :meth:`BeliefModel.advance`."""
         predicted, control = self._predicted(y, u), u.reshape(-1)
-        z = inverse_cdf(self._observed(predicted, control), noise[..., 0].reshape(-1))
+        z = inverse_cdf(self._sees.mix(predicted, control), noise[..., 0].reshape(-1))
         return self.expected_cost(y, u), self._successor(y, *self._weigh(predicted, control, z))
 
     # ---- kernels on N rows -----------------------------------------------------------------------------------------
 
     def _predicted(self, y: TensorDictBase, u: Tensor) -> Tensor:
         """P(next state j), ``[N, n]``."""
-        return _mixed(y.get("belief").reshape(-1, self.num_states), self.transition, u.reshape(-1))
-
-    def _observed(self, predicted: Tensor, u: Tensor) -> Tensor:
-        """P(observation z), ``[N, Z]``."""
-        return _mixed(predicted, self.observation, u)
+        return self._moves.mix(y.get("belief").reshape(-1, self.num_states), u.reshape(-1))
 
     def _weigh(self, predicted: Tensor, u: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """P(next state j, observation ``z``), ``[N, n]``, and its sum ``[N]``."""
-        weight = predicted * self.observation.transpose(1, 2)[u, z]
-        return weight, sum_first(weight.T.clone())
+        weight = self._sees.column(u, z).mul_(predicted)
+        return weight, sum_first(weight.clone().T)
 
     def _successor(self, y: TensorDictBase, weight: Tensor, total: Tensor) -> TensorDictBase:
         return self.successor(y, belief=(weight / total.unsqueeze(-1)).view(*y.batch_size, self.num_states))
 
 
-def _mixed(weight: Tensor, rows: Tensor, u: Tensor) -> Tensor:
-    """Mixtures ``[N, M]`` of the rows ``[U, n, M]`` that belong to controls ``u`` ``[N]``, with weights ``[N, n]``.
-
-    Multiplied and added number by number in an order that n alone decides: a product of matrices would round by N.
-    """
-    source, by_source = weight.T, rows.transpose(0, 1)
-    total: Tensor | None = None
-    for first in range(0, len(source), _BLOCK):
-        block = slice(first, first + _BLOCK)
-        part = sum_first(by_source[block].index_select(1, u).mul_(source[block].unsqueeze(-1)))
-        total = part if total is None else total.add_(part)
-    assert total is not None
-    return total
-
-
-def tiger(discount: float = 0.95, *, device: torch.device | str = "cpu") -> TabularModel:
-    r"""Tiger (Kaelbling, Littman and Cassandra 1998): controls listen, open left, open right; observations hear left, right.
-
-    Listening costs 1 and is right with probability 0.85; the door of the tiger costs 100, the other pays 10. After a door
-    is opened the tiger is placed anew.
-
-    Args:
-        discount: :math:`\alpha`.
-        device: where the model computes.
-
-    Examples:
-        >>> tiger().cost.tolist()
-        [[1.0, 100.0, -10.0], [1.0, -10.0, 100.0]]
-    """
-    half = torch.full((2, 2), 0.5)
-    transition = torch.stack([torch.eye(2), half, half])
-    hear = torch.tensor([[0.85, 0.15], [0.15, 0.85]])
-    observation = torch.stack([hear, half, half])
-    cost = torch.tensor([[1.0, 100.0, -10.0], [1.0, -10.0, 100.0]])
-    return TabularModel(transition, observation, cost, discount, device=device)
-
-
-def _rows(name: str, array: Tensor) -> Tensor:
-    """The distributions of ``array`` in float64, scaled to sum to one; raises unless they do up to rounding."""
-    rows = array.double()
-    sums = rows.sum(-1, keepdim=True)
-    if not bool((rows >= 0).all()) or not bool(((sums - 1.0).abs() <= 1e-5).all()):
-        worst = int((sums.squeeze(-1) - 1.0).abs().nan_to_num(torch.inf).argmax())
-        where = tuple(int(i) for i in torch.unravel_index(torch.tensor(worst), sums.shape[:-1]))
-        raise ValueError(f"rows of {name} must be nonnegative and sum to 1; row {where} sums to {float(sums[where]):.7g}")
-    return rows / sums
+def _names(name: str, given: Any, count: int) -> tuple[str, ...] | None:
+    if given is None:
+        return None
+    names = tuple(check_text(f"{name}[{i}]", member) for i, member in enumerate(check_sequence(name, given, str)))
+    if len(names) != count or len(set(names)) != count:
+        raise ValueError(f"{name} must hold {count} different names, got {shown(given)}")
+    return names

@@ -10,7 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_choice, check_instance, check_integer
-from torchrl_pomdp.envs.belief import BeliefModel, take_rows
+from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
@@ -65,8 +66,8 @@ class RolloutPolicy(TensorDictModuleBase):
             not fit the model, if the base policy's first controls are illegal, or if a cost is not finite.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("linear20")
         >>> policy = RolloutPolicy(problem.model, GreedyRepair(problem.model), trajectories=10)
         >>> y = policy(problem.start(torch.arange(4)))

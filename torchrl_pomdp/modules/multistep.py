@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
-from torchrl_pomdp.envs.belief import inverse_cdf, take_rows
+from torchrl_pomdp.envs.rows import inverse_cdf, take_rows
 from torchrl_pomdp.modules.lookahead import RolloutPolicy, cheapest, check_q_factors
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import check_distributions
@@ -43,8 +43,8 @@ class MultistepLookahead(TensorDictModuleBase):
         ValueError: if ``depth`` is not 1, 2 or 3, ``branches`` is not in 1 to 256, or ``margin`` is negative.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("line3")
         >>> policy = MultistepLookahead(RolloutPolicy(problem.model, GreedyRepair(problem.model)), depth=2)
         >>> policy(problem.start(torch.arange(4)))["q_factors"].shape

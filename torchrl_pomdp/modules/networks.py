@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_sizes
-from torchrl_pomdp.envs.belief import take_rows
+from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.modules.encoders import Encoder, transformed
 from torchrl_pomdp.modules.rowwise import RowLinear, rowwise
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
@@ -81,7 +81,7 @@ class PolicyNetwork(LocalNetwork):
         generator: generator of the initial weights; the global one is left alone.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.problems import make_problem
         >>> from torchrl_pomdp.modules import FlatEncoder
         >>> problem = make_problem("linear20")
         >>> network = PolicyNetwork(FlatEncoder(problem.model), 3, generator=torch.Generator().manual_seed(0))
@@ -122,8 +122,9 @@ class ValueNetwork(LocalNetwork):
         generator: generator of the initial weights; the global one is left alone.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import FlatEncoder, NeverRepairCost
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules import FlatEncoder
+        >>> from torchrl_pomdp.modules.repair import NeverRepairCost
         >>> problem = make_problem("linear20")
         >>> scale = NeverRepairCost(problem.model)
         >>> network = ValueNetwork(FlatEncoder(problem.model), scale, generator=torch.Generator().manual_seed(0))

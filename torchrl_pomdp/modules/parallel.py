@@ -32,8 +32,8 @@ class ParallelRollout(TensorDictModuleBase):
         ValueError: if there is no policy, or they are not of one model.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair, UrgencyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
         >>> problem = make_problem("linear20")
         >>> bases = GreedyRepair(problem.model), UrgencyRepair(problem.model)
         >>> policy = ParallelRollout([RolloutPolicy(problem.model, base) for base in bases])

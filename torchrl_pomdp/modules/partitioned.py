@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance, shown
-from torchrl_pomdp.envs.belief import take_rows
+from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.modules.networks import LocalNetwork, evaluate_networks
 from torchrl_pomdp.tensor_checks import check_entries
 
@@ -105,8 +105,8 @@ class PartitionedPolicy(_Partitioned):
         ValueError: if there is no policy; when called, if a part has no policy.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("linear20")
         >>> policy = PartitionedPolicy([GreedyRepair(problem.model)] * 6)
         >>> policy(problem.model.with_features(problem.start(torch.arange(4))))["action"].shape
@@ -132,8 +132,8 @@ class PartitionedValue(_Partitioned):
         ValueError: if there is no value; when called, if a part has no value.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import NeverRepairCost
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import NeverRepairCost
         >>> problem = make_problem("linear20")
         >>> value = PartitionedValue([NeverRepairCost(problem.model)] * 6)
         >>> value(problem.model.with_features(problem.start(torch.arange(4))))["state_value"].shape

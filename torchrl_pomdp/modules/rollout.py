@@ -11,7 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, shown
-from torchrl_pomdp.envs.belief import BeliefModel, put_rows, take_rows
+from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.rows import put_rows, take_rows
 from torchrl_pomdp.modules.compiling import compiled
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.truncation import Truncation
@@ -137,8 +138,8 @@ class TruncatedRollout(nn.Module):
             controls are illegal, or if a cost is not finite.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("line3")
         >>> cost = TruncatedRollout(problem.model, GreedyRepair(problem.model))
         >>> keys = torch.arange(2000)

@@ -9,24 +9,25 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_callable, check_instance, check_integer, shown
-from torchrl_pomdp.envs.belief import BeliefModel, take_rows
-from torchrl_pomdp.envs.partition import location_costs
-from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
+from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout, check_finite
+from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold
 
-__all__ = ["ClosedFormCost", "NeverRepairCost", "PolicyCost", "SteadyStateCost", "ZeroCost"]
+__all__ = ["ClosedFormCost", "ConstantCost", "PolicyCost", "ZeroCost"]
 
 
 class ClosedFormCost(TensorDictModuleBase):
-    """Base of the terminal costs that are computed from the belief alone; they write ``"state_value"`` ``[*B]``."""
+    """Base of the terminal costs that are computed from the feature state alone; they write ``"state_value"`` ``[*B]``.
 
-    in_keys = ["belief"]
+    Subclasses set ``in_keys``, the entries that they read, and define :meth:`costs`.
+    """
+
     out_keys = ["state_value"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -39,81 +40,51 @@ class ClosedFormCost(TensorDictModuleBase):
         """Costs ``[*B]`` of feature states ``[*B]``."""
 
 
+class ConstantCost(ClosedFormCost):
+    r""":math:`\hat J` is one number for all states, such as a bound of all costs.
+
+    Args:
+        model: the belief model.
+        cost: the number.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if the number is not finite.
+
+    Examples:
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> problem = make_problem("line3")
+        >>> ConstantCost(problem.model, 7).costs(problem.start(torch.arange(2))).tolist()
+        [7.0, 7.0]
+    """
+
+    def __init__(self, model: BeliefModel, cost: float) -> None:
+        super().__init__()
+        self.dtype = check_instance("model", model, BeliefModel).dtype
+        self.in_keys = list(model.state_keys[:1])
+        self.cost = check_number("cost", cost, "(-inf, inf)")
+
+    def costs(self, y: TensorDictBase) -> Tensor:
+        """The number, ``[*B]``."""
+        check_instance("y", y, TensorDictBase)
+        return torch.full(y.batch_size, self.cost, dtype=self.dtype, device=y.device)
+
+
 class ZeroCost(ClosedFormCost):
     r""":math:`\hat J=0`: what follows a cut is left out, on purpose.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.problems import make_problem
         >>> ZeroCost().costs(make_problem("line3").start(torch.arange(2))).tolist()
         [0.0, 0.0]
     """
 
-    def costs(self, y: TensorDictBase) -> Tensor:
-        """Zeros ``[*B]`` of the belief's type."""
-        return _belief(y).new_zeros(y.batch_size)
-
-
-class SteadyStateCost(ClosedFormCost):
-    r""":math:`\hat J(y)=\hat g(y)/(1-\alpha)`: the present stage cost for ever, as if damage neither grew nor was repaired.
-
-    Args:
-        model: the repair model; its stage cost does not depend on the control.
-
-    Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> problem = make_problem("line3")
-        >>> y = SteadyStateCost(problem.model)(problem.start(torch.arange(2)))
-        >>> torch.allclose(y["state_value"] * 0.01, problem.model.expected_cost(y))
-        True
-    """
-
-    def __init__(self, model: RepairModel) -> None:
-        super().__init__()
-        self.model = check_instance("model", model, RepairModel)
+    in_keys: list[str] = []
 
     def costs(self, y: TensorDictBase) -> Tensor:
-        """Costs ``[*B]``."""
-        _belief(y)
-        return self.model.expected_cost(y) / (1.0 - self.model.discount)
-
-
-class NeverRepairCost(ClosedFormCost):
-    r"""Exact cost of never repairing, the sum over locations of :math:`b\,(I-\alpha P)^{-1}c`, with P the damage chain.
-
-    Args:
-        model: the repair model.
-
-    Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> problem = make_problem("line3")
-        >>> y = problem.start(torch.arange(2))
-        >>> bool((NeverRepairCost(problem.model).costs(y) >= SteadyStateCost(problem.model).costs(y)).all())
-        True
-    """
-
-    def __init__(self, model: RepairModel) -> None:
-        super().__init__()
-        chain = check_instance("model", model, RepairModel).chain.double()
-        system = torch.eye(model.num_levels, dtype=chain.dtype, device=chain.device) - model.discount * chain
-        # Discounted cost of one location that starts at each level.
-        level_costs = torch.linalg.solve(system, model.costs.double()).to(model.dtype)
-        check_finite(f"costs of the model for ever must be finite in {model.dtype}", level_costs)
-        self.level_costs = tuple(level_costs.tolist())
-
-    def costs(self, y: TensorDictBase) -> Tensor:
-        """Costs ``[*B]``."""
-        # Planes [L, K, *B] are summed in the same order whatever the batch.
-        belief = _belief(y)
-        if belief.shape[y.ndim + 1 :] != (len(self.level_costs),):
-            raise ValueError(f"entry 'belief' of y must end in {len(self.level_costs)} levels, got {tuple(belief.shape)}")
-        return sum_first(location_costs(belief.movedim((-2, -1), (0, 1)), self.level_costs))
-
-
-def _belief(y: TensorDictBase) -> Tensor:
-    belief = check_instance("y", y, TensorDictBase).get("belief", None)
-    if not isinstance(belief, Tensor) or not belief.is_floating_point():
-        raise ValueError(f"y must hold the beliefs as entry 'belief', got {shown(belief)}")
-    return belief
+        """Zeros ``[*B]`` of the type of the state's floating entries."""
+        kinds = [leaf.dtype for leaf in check_instance("y", y, TensorDictBase).values() if leaf.is_floating_point()]
+        return torch.zeros(y.batch_size, dtype=kinds[0] if kinds else None, device=y.device)
 
 
 class PolicyCost(TensorDictModuleBase):
@@ -141,8 +112,8 @@ class PolicyCost(TensorDictModuleBase):
             model, or by :class:`TruncatedRollout`.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("line3")
         >>> cost = PolicyCost(problem.model, GreedyRepair(problem.model), trajectories=5)
         >>> y = cost(problem.start(torch.arange(400)))

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, shown
-from torchrl_pomdp.envs.belief import BeliefModel
+from torchrl_pomdp.envs.belief_model import BeliefModel
 
 __all__ = ["AfterSteps", "OnEntering", "OnLeaving", "Truncation"]
 

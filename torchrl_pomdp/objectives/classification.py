@@ -46,8 +46,9 @@ class ClassificationLoss(LabelLoss):
 
     Examples:
         >>> import torch
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair, FlatEncoder, PolicyNetwork, RolloutPolicy
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules import FlatEncoder, PolicyNetwork, RolloutPolicy
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> model = make_problem("linear20").model
         >>> y = make_problem("linear20").start(torch.arange(8))
         >>> batch = RolloutPolicy(model, GreedyRepair(model))(model.with_features(y))

@@ -37,8 +37,9 @@ class ValueLoss(LabelLoss):
 
     Examples:
         >>> import torch
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import FlatEncoder, GreedyRepair, NeverRepairCost, PolicyCost, ValueNetwork
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules import FlatEncoder, PolicyCost, ValueNetwork
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
         >>> problem = make_problem("linear20")
         >>> model, scale = problem.model, NeverRepairCost(problem.model)
         >>> batch = PolicyCost(model, GreedyRepair(model))(problem.start(torch.arange(8)))

@@ -1,7 +1,7 @@
 """Tables and pictures of results."""
 
 from torchrl_pomdp.report.effort import Effort, effort, effort_table
-from torchrl_pomdp.report.figures import cost_figure, draw, iteration_figure, time_figure, trajectory_figure
+from torchrl_pomdp.report.figures import cost_figure, draw, iteration_figure, time_figure
 from torchrl_pomdp.report.tables import Result, interval_text, is_iteration, paired_ratios, paired_table, ratio_texts, table
 
 __all__ = [
@@ -19,5 +19,4 @@ __all__ = [
     "ratio_texts",
     "table",
     "time_figure",
-    "trajectory_figure",
 ]

@@ -8,20 +8,17 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-from tensordict import TensorDictBase
-
 from torchrl_pomdp.checks import check_callable, check_instance, check_mapping, check_sequence
-from torchrl_pomdp.envs.repair import REPAIR, RepairModel
 from torchrl_pomdp.evaluation import Comparison, Estimate
 from torchrl_pomdp.files import write_bytes
+from torchrl_pomdp.pictures import new_figure
 from torchrl_pomdp.report.effort import check_iterations, effort
 from torchrl_pomdp.report.tables import Result, half_width, ratio_texts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["cost_figure", "draw", "iteration_figure", "time_figure", "trajectory_figure"]
+__all__ = ["cost_figure", "draw", "iteration_figure", "time_figure"]
 
 
 def draw(figures: Mapping[Path, Callable[[], Figure]]) -> str:
@@ -59,7 +56,7 @@ def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
     """
     check_sequence("results", results, Result, least=1)
     check_instance("title", title, str)
-    figure = _new_figure(1.4 * len(results) + 1.6, 3.6)
+    figure = new_figure(1.4 * len(results) + 1.6, 3.6)
     axes = figure.add_subplot()
     means = [result.comparison.cost.mean for result in results]
     names = [f"{result.name}\n{ratio_texts(result.comparison.ratio)[0]}" for result in results]
@@ -83,7 +80,7 @@ def iteration_figure(lines: Mapping[str, Sequence[Comparison]]) -> Figure:
     """
     for name, comparisons in check_mapping("lines", lines, Sequence).items():
         check_sequence(f"lines[{name!r}]", comparisons, Comparison)
-    figure = _new_figure(6.0, 3.8)
+    figure = new_figure(6.0, 3.8)
     axes = figure.add_subplot()
     for number, (name, comparisons) in enumerate(lines.items()):
         # Where a ratio means nothing there is a gap.
@@ -111,7 +108,7 @@ def time_figure(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     """
     for name, iterations in check_mapping("runs", runs, Sequence).items():
         check_iterations(f"runs[{name!r}]", iterations)
-    figure = _new_figure(2.2 * len(runs) + 3.0, 4.0)
+    figure = new_figure(2.2 * len(runs) + 3.0, 4.0)
     axes = figure.add_subplot()
     ticks, labels = [], []
     for number, (name, iterations) in enumerate(runs.items()):
@@ -131,52 +128,3 @@ def time_figure(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside upper center", ncols=3, fontsize="small")
     return figure
-
-
-def trajectory_figure(model: RepairModel, trajectory: TensorDictBase, title: str = "") -> Figure:
-    """One trajectory: locations by time, colour the expected damage, robots' paths over it, repairs marked.
-
-    Args:
-        model: the repair model.
-        trajectory: ``[T]`` with ``belief``, ``location`` and ``action``, as ``BeliefEnv.rollout`` gives it.
-        title: title of the figure.
-
-    Raises:
-        TypeError: if something is of the wrong kind.
-        ValueError: if an entry is missing.
-        ImportError: if matplotlib, the extra ``plot``, is not installed.
-    """
-    check_instance("model", model, RepairModel)
-    check_instance("title", title, str)
-    missing = [
-        key for key in ("belief", "location", "action") if key not in check_instance("trajectory", trajectory, TensorDictBase)
-    ]
-    if missing:
-        raise ValueError(f"trajectory must have the entry {missing[0]!r}, got {sorted(map(str, trajectory.keys()))}")
-    steps = trajectory.batch_size[0]
-    damage = trajectory["belief"] @ torch.arange(model.num_levels, dtype=model.dtype, device=model.device)
-    figure = _new_figure(max(5.0, 0.14 * steps + 2.5), max(2.5, 0.16 * model.num_locations + 1.2))
-    axes = figure.add_subplot()
-    image = axes.imshow(
-        damage.T.cpu().numpy(), aspect="auto", cmap="YlOrRd", vmin=0, vmax=model.num_levels - 1, interpolation="nearest"
-    )
-    figure.colorbar(image, ax=axes, label="expected damage level")
-    controls = model.split_controls(trajectory["action"])
-    for robot in range(model.num_robots):
-        path = trajectory["location"][:, robot].cpu().numpy()
-        axes.plot(range(steps), path, color="#1f4e79", linewidth=1.2, label=f"robot {robot + 1}")
-        repairs = (controls[:, robot] == REPAIR).nonzero().squeeze(-1).cpu().numpy()
-        axes.scatter(repairs, path[repairs], marker="P", s=44, color="#1f4e79", edgecolor="white", linewidth=0.6)
-    axes.scatter([], [], marker="P", color="#1f4e79", label="repair")
-    axes.legend(loc="upper right", fontsize="small")
-    axes.set(xlabel="stage", ylabel="location", title=title)
-    axes.locator_params(integer=True)
-    return figure
-
-
-def _new_figure(width: float, height: float) -> Figure:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'torchrl-pomdp[plot]'") from error
-    return Figure(figsize=(width, height), layout="constrained", dpi=120)

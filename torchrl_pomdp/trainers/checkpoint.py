@@ -14,21 +14,22 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torchrl_pomdp.checks import check_choice, check_flag, check_instance, check_integer, check_path, check_text
+from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_path, check_text
 from torchrl_pomdp.config import PolicyIterationConfig
-from torchrl_pomdp.envs.presets import PRESETS, Problem, make_problem
 from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, parse_tensors, tensor_bytes, write_bytes
 from torchrl_pomdp.identity import digest
-from torchrl_pomdp.modules import NeverRepairCost, PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
+from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork, as_policy
+from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.problems.specs import problem_from_spec
 from torchrl_pomdp.tensor_checks import check_device
-from torchrl_pomdp.trainers.architecture import BASE_POLICIES, ENCODERS, make_networks, make_values, partition_of
+from torchrl_pomdp.trainers.architecture import make_encoder, make_networks, make_values
 
 __all__ = ["Checkpoint", "load_checkpoint", "open_run_folder", "problem_digest", "save_checkpoint"]
 
-_FORMAT = "torchrl_pomdp policy 3"
+_FORMAT = "torchrl_pomdp policy 4"
 # What a checkpoint's JSON text holds.
 _ABOUT = {
-    "format", "problem", "partitioned", "problem_digest", "config", "algorithm", "iteration", "base", "value_parts",
+    "format", "problem", "spec", "problem_digest", "config", "algorithm", "iteration", "base", "value_parts",
 }  # fmt: skip
 
 
@@ -43,7 +44,7 @@ class Checkpoint:
         iteration: number of the policy iteration that made it, from 1; 0 for a base policy, the best one where no iteration
             was accepted.
         policy: the partitioned policy, or the base policy.
-        value: the partitioned terminal cost; never repairing in the parts without a value network.
+        value: the partitioned terminal cost; the problem's pessimistic cost in the parts without a value network.
 
     Raises:
         TypeError: if something is of the wrong kind.
@@ -101,13 +102,15 @@ def open_run_folder(path: str | PathLike[str], identity: dict[str, Any]) -> Path
 
 
 def problem_digest(problem: Problem) -> str:
-    """What a problem is, whatever it is called: model with partition, start states, training states.
+    """What a problem is, whatever it is called: all that decides what is learnt on it.
 
     Examples:
+        >>> from torchrl_pomdp.problems import make_problem
         >>> problem_digest(make_problem("line3")) == problem_digest(make_problem("line3", partitioned=False))
         False
     """
-    return digest((problem.model, problem.start, problem.training))
+    content = (problem.model, problem.start, problem.training, problem.pessimistic_cost, problem.symmetries, problem.encoder)
+    return digest(content)
 
 
 def save_checkpoint(path: str | PathLike[str], checkpoint: Checkpoint) -> None:
@@ -115,8 +118,9 @@ def save_checkpoint(path: str | PathLike[str], checkpoint: Checkpoint) -> None:
 
     Args:
         path: file to make or replace, atomically.
-        checkpoint: the policy and its provenance. The problem must be a preset; the policy a network in every part, as the
-            configuration describes it, or one of the base policies by name.
+        checkpoint: the policy and its provenance. The policy must be a network in every part, as the configuration
+            describes it, or one of the problem's base policies. A problem that has a spec must be what its spec describes;
+            one without is kept by its digest alone, and is given back to :func:`load_checkpoint`.
 
     Raises:
         TypeError: if ``path`` is no path or ``checkpoint`` no checkpoint.
@@ -125,10 +129,11 @@ def save_checkpoint(path: str | PathLike[str], checkpoint: Checkpoint) -> None:
     """
     path = check_path("path", path)
     check_instance("checkpoint", checkpoint, Checkpoint)
-    _check_preset(checkpoint.problem)
+    _check_spec(checkpoint.problem)
+    own = checkpoint.problem if checkpoint.problem.spec is None else None
     saved = tensor_bytes(_content(checkpoint))
     try:
-        loaded = _parse(parse_tensors(saved, path), checkpoint.problem.model.device)
+        loaded = _parse(parse_tensors(saved, path), own, checkpoint.problem.model.device)
     except ValueError as error:
         raise ValueError(f"checkpoint could not be loaded again: {error}") from error
     for name in ("policy", "value"):
@@ -141,21 +146,27 @@ def save_checkpoint(path: str | PathLike[str], checkpoint: Checkpoint) -> None:
     write_bytes(path, saved)
 
 
-def load_checkpoint(path: str | PathLike[str], *, device: torch.device | str = "cpu") -> Checkpoint:
-    """Read a checkpoint back; tensors and JSON only, nothing is unpickled.
+def load_checkpoint(
+    path: str | PathLike[str], *, problem: Problem | None = None, device: torch.device | str = "cpu"
+) -> Checkpoint:
+    """Read a checkpoint back; tensors and JSON only, nothing is unpickled and no code is imported.
 
     Args:
         path: file written by :func:`save_checkpoint`.
-        device: where the policy and its problem are put.
+
+    Keyword Args:
+        problem: the problem that the policy was trained on, which a problem without a spec needs; None: as the file says.
+        device: where the policy and its problem are put, if the problem is not given.
 
     Raises:
-        TypeError: if ``path`` is no path.
+        TypeError: if ``path`` is no path or ``problem`` no problem.
         DamagedFileError: a ``ValueError``, if the file is not as it was written, of another kind, or of a problem that has
             changed since.
-        ValueError: if there is no such file or no such device.
+        ValueError: if there is no such file or no such device, if the problem is needed and not given, or if it is another.
 
     Examples:
         >>> import tempfile
+        >>> from torchrl_pomdp.problems import make_problem
         >>> problem, config = make_problem("line3"), PolicyIterationConfig()
         >>> policy, value = make_networks(problem, config, seed=0), make_values(problem, config, seed=0)
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -165,25 +176,37 @@ def load_checkpoint(path: str | PathLike[str], *, device: torch.device | str = "
         'line3'
     """
     path, device = check_path("path", path), check_device("device", device)
+    if problem is not None:
+        check_instance("problem", problem, Problem)
     if not path.is_file():
         raise ValueError(f"there is no checkpoint {path}")
     try:
-        return _parse(load_tensors(path), device)
+        return _parse(load_tensors(path), problem, device)
+    except _OtherProblemError as error:
+        raise ValueError(f"{path}: {error}") from error
     except Exception as error:  # what a foreign file holds can be anything
         raise DamagedFileError(f"{path} is damaged or no checkpoint of this library: {error}") from error
 
 
-def _check_preset(problem: Problem) -> None:
-    """Raise unless the problem is what :func:`make_problem` makes of its name."""
-    if problem.name not in PRESETS:
-        raise ValueError(f"checkpoint.problem must be one of {', '.join(sorted(PRESETS))}, got {problem.name!r}")
-    if problem_digest(problem) != problem_digest(make_problem(problem.name, partitioned=problem.partitioned)):
-        raise ValueError(f"checkpoint.problem must be the preset {problem.name}, got another problem of that name")
+def _check_spec(problem: Problem) -> None:
+    """Raise unless the problem is what its spec describes, where it has one."""
+    if problem.spec is None:
+        return
+    described = problem_from_spec(problem.spec, device=problem.model.device)
+    if (described.name, problem_digest(described)) != (problem.name, problem_digest(problem)):
+        raise ValueError(
+            f"checkpoint.problem must be what its spec describes, got another problem {problem.name!r}: "
+            "with spec=None it is kept by its content alone"
+        )
 
 
-def _check_networks(policy: TensorDictModuleBase) -> None:
+class _OtherProblemError(ValueError):
+    """The file is as it was written, but the problem that it needs is not given, or another one is."""
+
+
+def _check_networks(policy: TensorDictModuleBase, problem: Problem) -> None:
     if not isinstance(policy, PartitionedPolicy):
-        names = ", ".join(BASE_POLICIES)
+        names = ", ".join(problem.base_policies)
         raise ValueError(
             f"checkpoint.policy must be a PartitionedPolicy of networks, or one of {names} as it is by name, "
             f"got another {type(policy).__name__}"
@@ -197,12 +220,12 @@ def _content(checkpoint: Checkpoint) -> dict[str, Any]:
     """A checkpoint as plain dictionaries of tensors and texts, with their digest."""
     base = _base_name(checkpoint.policy, checkpoint.problem)
     if base is None:
-        _check_networks(checkpoint.policy)
+        _check_networks(checkpoint.policy, checkpoint.problem)
     parts = [part for part, value in enumerate(checkpoint.value.values) if isinstance(value, ValueNetwork)]
     about = {
         "format": _FORMAT,
         "problem": checkpoint.problem.name,
-        "partitioned": checkpoint.problem.partitioned,
+        "spec": checkpoint.problem.spec,
         "problem_digest": problem_digest(checkpoint.problem),
         "config": asdict(checkpoint.config),
         "algorithm": checkpoint.algorithm,
@@ -221,7 +244,7 @@ def _content(checkpoint: Checkpoint) -> dict[str, Any]:
 def _base_name(policy: TensorDictModuleBase, problem: Problem) -> str | None:
     """Name of a base policy; None for any other policy."""
     own = digest(policy)
-    return next((name for name, make in BASE_POLICIES.items() if digest(make(problem.model)) == own), None)
+    return next((name for name, policy in problem.base_policies.items() if digest(policy) == own), None)
 
 
 def _locals(module: TensorDictModuleBase) -> list[Any]:
@@ -237,7 +260,7 @@ def _tensors(module: nn.Module) -> dict[str, Tensor]:
     return {name: state[name].detach().cpu().clone(memory_format=torch.contiguous_format) for name in sorted(state)}
 
 
-def _parse(content: Any, device: torch.device) -> Checkpoint:
+def _parse(content: Any, problem: Problem | None, device: torch.device) -> Checkpoint:
     """The checkpoint that a file's content stands for; a ``ValueError`` or ``TypeError`` where it stands for none."""
     if not isinstance(content, dict) or not isinstance(content.get("about"), str):
         raise ValueError("it holds no description")
@@ -253,44 +276,58 @@ def _parse(content: Any, device: torch.device) -> Checkpoint:
     if content["digest"] != digest({name: content[name] for name in ("about", "policy", "value")}):
         raise ValueError("its content does not agree with its digest")
     config = PolicyIterationConfig(**check_instance("config", about["config"], dict))
-    name = check_choice("problem", about["problem"], sorted(PRESETS))
-    problem = make_problem(name, partitioned=check_flag("partitioned", about["partitioned"]), device=device)
-    if about["problem_digest"] != problem_digest(problem):
-        raise ValueError(f"problem {name} is not what it was when the checkpoint was made")
+    problem = _problem(about, problem, device)
     policy = _parse_base(about["base"], problem, content) or _parse_policy(problem, config, content["policy"])
     value = _parse_value(problem, config, content["value"], about["value_parts"])
     return Checkpoint(problem, config, about["algorithm"], about["iteration"], policy.eval(), value.eval())
+
+
+def _problem(about: dict[str, Any], given: Problem | None, device: torch.device) -> Problem:
+    """The problem that was trained on: the given one, as it is or with a single part, or what the spec describes."""
+    name, spec, own = check_text("problem", about["problem"]), about["spec"], about["problem_digest"]
+    if given is not None:
+        found = next((one for one in (given, given.unpartitioned()) if problem_digest(one) == own), None)
+        if found is None:
+            raise _OtherProblemError(f"problem must be {name}, as it was when the checkpoint was made, got another one")
+        return found
+    if spec is None:
+        raise _OtherProblemError(
+            f"the policy was trained on {name}, a problem that the file cannot describe: build it and give it as problem="
+        )
+    problem = problem_from_spec(spec, device=device)
+    if (problem.name, problem_digest(problem)) != (name, own):
+        raise ValueError(f"problem {name} is not what it was when the checkpoint was made")
+    return problem
 
 
 def _parse_base(base: Any, problem: Problem, content: dict[str, Any]) -> TensorDictModuleBase | None:
     if base is None:
         return None
     check_instance("base", base, dict)
-    name = check_choice("base", base.get("name"), BASE_POLICIES)
-    policy = BASE_POLICIES[name](problem.model)
+    name = check_choice("base", base.get("name"), problem.base_policies)
+    policy = as_policy(problem.base_policies[name], problem.model)
     if base.get("digest") != digest(policy) or content["policy"] != {}:
         raise ValueError(f"base policy {name} is not what it was when the checkpoint was made")
     return policy
 
 
 def _parse_policy(problem: Problem, config: PolicyIterationConfig, tensors: Any) -> PartitionedPolicy:
-    sizes = [ENCODERS[config.encoder](problem.model).num_features, *config.hidden, problem.model.num_controls]
-    _check_tensors("policies", tensors, range(partition_of(problem).num_parts), sizes, problem.model.dtype)
+    sizes = [make_encoder(problem, config).num_features, *config.hidden, problem.model.num_controls]
+    _check_tensors("policies", tensors, range(problem.partition.num_parts), sizes, problem.model.dtype)
     policy = make_networks(problem, config, seed=0)
     policy.load_state_dict(tensors)
     return policy
 
 
 def _parse_value(problem: Problem, config: PolicyIterationConfig, tensors: Any, trained: Any) -> PartitionedValue:
-    parts = partition_of(problem).num_parts
+    parts = problem.partition.num_parts
     check_instance("value_parts", trained, list)
     if any(check_integer("value_parts", part, 0, parts - 1) != part for part in trained) or len(set(trained)) < len(trained):
         raise ValueError(f"value_parts must hold different parts, got {trained}")
-    sizes = [ENCODERS[config.encoder](problem.model).num_features, *config.value_hidden, 1]
+    sizes = [make_encoder(problem, config).num_features, *config.value_hidden, 1]
     _check_tensors("values", tensors, trained, sizes, problem.model.dtype)
-    never = NeverRepairCost(problem.model)
     networks = make_values(problem, config, seed=0).values if trained else ()
-    value = PartitionedValue([networks[part] if part in trained else never for part in range(parts)])
+    value = PartitionedValue([networks[part] if part in trained else problem.pessimistic_cost for part in range(parts)])
     value.load_state_dict(tensors)
     return value
 

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_sequence, shown
-from torchrl_pomdp.envs.presets import Problem
 from torchrl_pomdp.modules import Truncation
-from torchrl_pomdp.trainers.architecture import partition_of
+from torchrl_pomdp.problems.problem import Problem
 
 __all__ = ["Evaluate", "Improve", "Step", "checked_plan"]
 
@@ -57,7 +56,7 @@ def checked_plan(plan: Sequence[Step], problem: Problem) -> tuple[Step, ...]:
         raise ValueError("plan is empty: an iteration needs at least one step")
     for step in steps:
         for part in step.parts:
-            check_integer("parts of the plan", part, 0, partition_of(problem).num_parts - 1)
+            check_integer("parts of the plan", part, 0, problem.partition.num_parts - 1)
         if step.truncation is not None:
             step.truncation.check_model(problem.model)
     return steps

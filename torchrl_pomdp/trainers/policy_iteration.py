@@ -29,25 +29,25 @@ from torchrl_pomdp.checks import check_callable, check_flag, check_instance, che
 from torchrl_pomdp.collectors import OnLabels, PartSampler, PolicyEvaluation, RolloutImprovement, StateMemory, training_states
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.belief_env import BeliefEnv
-from torchrl_pomdp.envs.presets import Problem
-from torchrl_pomdp.envs.symmetry import symmetries
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import check_claimed, claim
 from torchrl_pomdp.identity import digest, identity
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import (
     Encoder,
-    NeverRepairCost,
     PartitionedPolicy,
     PartitionedValue,
+    Policy,
     PolicyCost,
     PolicyNetwork,
     RolloutPolicy,
+    as_policy,
 )
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.objectives import ClassificationLoss, ValueLoss
-from torchrl_pomdp.trainers.architecture import ENCODERS, make_networks, make_values, partition_of
+from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.trainers.architecture import make_encoder, make_networks, make_values
 from torchrl_pomdp.trainers.logs import clear_log
 from torchrl_pomdp.trainers.parts import PartRecord, train_part
 from torchrl_pomdp.trainers.plan import Evaluate, Improve, Step, checked_plan
@@ -67,7 +67,7 @@ class Iteration:
     Attributes:
         number: from 1.
         policy: the trained policy.
-        value: terminal cost: the trained value networks, and never repairing where there are none.
+        value: terminal cost: the trained value networks, and the pessimistic cost where there are none.
         accepted: whether it is the best policy so far.
         reason: why, in words with numbers.
         comparison: costs against the best policy before, on the validation states.
@@ -97,7 +97,7 @@ class PolicyIteration:
     Args:
         problem: model, start states and training states.
         config: the numbers.
-        base_policy: the policy :math:`\mu_0` that is improved first.
+        base_policy: the policy :math:`\mu_0` that is improved first; any callable that writes ``"action"``.
         plan: the steps of an iteration.
 
     Keyword Args:
@@ -108,14 +108,14 @@ class PolicyIteration:
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if the problem's model has no partition, or the plan is empty or names a part that is none; when iterated,
+        ValueError: if the plan is empty or names a part that is none; when iterated,
             if the folder holds a run that differs in the content of its problem, its configuration, plan or base policy, or
             in the library's version.
         FileNotFoundError: when iterated, if the folder is deleted meanwhile.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> from torchrl_pomdp.trainers import papi_nt
         >>> problem = make_problem("line3")
         >>> config = PolicyIterationConfig(iterations=1, samples_per_part=40, least_steps=1, validation_states=50)
@@ -128,7 +128,7 @@ class PolicyIteration:
         self,
         problem: Problem,
         config: PolicyIterationConfig,
-        base_policy: TensorDictModuleBase,
+        base_policy: Policy,
         plan: Sequence[Step],
         *,
         folder: Path | None = None,
@@ -136,17 +136,17 @@ class PolicyIteration:
         progress: bool = False,
         on_labels: OnLabels | None = None,
     ) -> None:
-        self.partition = partition_of(check_instance("problem", problem, Problem))
+        self.partition = check_instance("problem", problem, Problem).partition
         self.problem, self.config = problem, check_instance("config", config, PolicyIterationConfig)
-        self.base_policy = check_instance("base_policy", base_policy, TensorDictModuleBase)
+        self.base_policy = as_policy(base_policy, problem.model)
         self.plan = checked_plan(plan, problem)
         self.folder = None if folder is None else check_path("folder", folder)
         self.logger = None if logger is None else check_instance("logger", logger, Logger)
         self.progress = check_flag("progress", progress)
         self.on_labels = None if on_labels is None else check_callable("on_labels", on_labels)
-        self._scale = NeverRepairCost(problem.model)
-        self._symmetries = symmetries(problem.model)[: None if config.symmetries else 1]
-        self._encoder = _shared_encoder(base_policy) or ENCODERS[config.encoder](problem.model)
+        self._scale = problem.pessimistic_cost
+        self._symmetries = problem.symmetries[: None if config.symmetries else 1]
+        self._encoder = _shared_encoder(self.base_policy) or make_encoder(problem, config)
         self._start()
 
     def _start(self) -> None:
@@ -280,6 +280,8 @@ class PolicyIteration:
         for batch in labelled.values():
             for symmetry in self._symmetries:
                 image = symmetry(batch.exclude("collector"))
+                # A symmetry need not know of parts.
+                image.set("partition", self.partition(image))
                 for part, found in images.items():
                     found.append(image[image.get("partition") == part])
         return {part: cast(TensorDictBase, torch.cat(found)) for part, found in images.items()}

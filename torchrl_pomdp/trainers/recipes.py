@@ -18,20 +18,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from tensordict.nn import TensorDictModuleBase
-
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.config import PolicyIterationConfig
-from torchrl_pomdp.envs.presets import Problem
-from torchrl_pomdp.modules import OnEntering, PartitionedPolicy, RolloutPolicy, TerminalCost, Truncation
-from torchrl_pomdp.trainers.architecture import partition_of
+from torchrl_pomdp.modules import OnEntering, PartitionedPolicy, Policy, RolloutPolicy, TerminalCost, Truncation
+from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.trainers.plan import Evaluate, Improve
 from torchrl_pomdp.trainers.policy_iteration import PolicyIteration
 
 __all__ = ["api", "papi_nt", "papi_t", "r_nt", "r_t"]
 
 
-def r_nt(problem: Problem, base_policy: TensorDictModuleBase, **options: Any) -> RolloutPolicy:
+def r_nt(problem: Problem, base_policy: Policy, **options: Any) -> RolloutPolicy:
     """Rollout without truncation: online, nothing is learnt.
 
     Args:
@@ -41,8 +38,8 @@ def r_nt(problem: Problem, base_policy: TensorDictModuleBase, **options: Any) ->
 
     Examples:
         >>> import torch
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
         >>> problem = make_problem("line3")
         >>> r_nt(problem, GreedyRepair(problem.model))(problem.start(torch.arange(2)))["action"].shape
         torch.Size([2])
@@ -50,7 +47,7 @@ def r_nt(problem: Problem, base_policy: TensorDictModuleBase, **options: Any) ->
     return RolloutPolicy(check_instance("problem", problem, Problem).model, base_policy, **options)
 
 
-def r_t(problem: Problem, base_policy: TensorDictModuleBase, terminal_cost: TerminalCost, **options: Any) -> PartitionedPolicy:
+def r_t(problem: Problem, base_policy: Policy, terminal_cost: TerminalCost, **options: Any) -> PartitionedPolicy:
     r"""Rollout with truncation: online, nothing is learnt. It simulates as :func:`papi_t` does for its labels.
 
     Where a simulation enters a part of an earlier stage, it ends with :math:`\alpha^m\hat J`; those that start in the first
@@ -68,8 +65,8 @@ def r_t(problem: Problem, base_policy: TensorDictModuleBase, terminal_cost: Term
 
     Examples:
         >>> import torch
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import GreedyRepair, SteadyStateCost
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair, SteadyStateCost
         >>> problem = make_problem("linear20")
         >>> policy = r_t(problem, GreedyRepair(problem.model), SteadyStateCost(problem.model), trajectories=2)
         >>> policy(problem.model.with_features(problem.start(torch.arange(2))))["action"].shape
@@ -82,9 +79,7 @@ def r_t(problem: Problem, base_policy: TensorDictModuleBase, terminal_cost: Term
     return PartitionedPolicy([local[part] for part in sorted(local)])
 
 
-def papi_nt(
-    problem: Problem, config: PolicyIterationConfig, base_policy: TensorDictModuleBase, **options: Any
-) -> PolicyIteration:
+def papi_nt(problem: Problem, config: PolicyIterationConfig, base_policy: Policy, **options: Any) -> PolicyIteration:
     """Partitioned policy iteration without truncation; the partition's stages one after the other.
 
     Args:
@@ -94,8 +89,8 @@ def papi_nt(
         options: see :class:`PolicyIteration`.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import UrgencyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import UrgencyRepair
         >>> problem = make_problem("linear20")
         >>> [step.parts for step in papi_nt(problem, PolicyIterationConfig(), UrgencyRepair(problem.model)).plan]
         [(3, 4, 5), (0, 1, 2)]
@@ -104,9 +99,7 @@ def papi_nt(
     return PolicyIteration(problem, config, base_policy, plan, **options)
 
 
-def papi_t(
-    problem: Problem, config: PolicyIterationConfig, base_policy: TensorDictModuleBase, **options: Any
-) -> PolicyIteration:
+def papi_t(problem: Problem, config: PolicyIterationConfig, base_policy: Policy, **options: Any) -> PolicyIteration:
     r"""Partitioned policy iteration with truncation: simulations from a later stage end where they enter an earlier one.
 
     There :math:`\alpha^m\hat J` of that part's value network is added. Every stage but the last has value networks.
@@ -121,8 +114,8 @@ def papi_t(
         ValueError: if the partition has one stage alone.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import UrgencyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import UrgencyRepair
         >>> problem = make_problem("linear20")
         >>> plan = papi_t(problem, PolicyIterationConfig(), UrgencyRepair(problem.model)).plan
         >>> [(type(step).__name__, step.parts) for step in plan]
@@ -138,7 +131,7 @@ def papi_t(
 
 
 def _stages(problem: Problem) -> tuple[tuple[int, ...], ...]:
-    return partition_of(check_instance("problem", problem, Problem)).stages
+    return check_instance("problem", problem, Problem).partition.stages
 
 
 def _cut_stages(problem: Problem, algorithm: str) -> list[tuple[tuple[int, ...], Truncation | None]]:
@@ -150,11 +143,11 @@ def _cut_stages(problem: Problem, algorithm: str) -> list[tuple[tuple[int, ...],
     return [(stage, OnEntering(parts) if parts else None) for stage, parts in zip(stages, earlier, strict=True)]
 
 
-def api(problem: Problem, config: PolicyIterationConfig, base_policy: TensorDictModuleBase, **options: Any) -> PolicyIteration:
+def api(problem: Problem, config: PolicyIterationConfig, base_policy: Policy, **options: Any) -> PolicyIteration:
     """Policy iteration with one network for the whole feature space; the problem must have a single part.
 
     Args:
-        problem: the problem, ``make_problem(name, partitioned=False)``.
+        problem: the problem, such as :meth:`Problem.unpartitioned` of another.
         config: the numbers; ``samples_per_part`` is then the number of all samples.
         base_policy: the policy that is improved first.
         options: see :class:`PolicyIteration`.
@@ -163,15 +156,13 @@ def api(problem: Problem, config: PolicyIterationConfig, base_policy: TensorDict
         ValueError: if the problem has several parts.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
-        >>> from torchrl_pomdp.modules import UrgencyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import UrgencyRepair
         >>> problem = make_problem("linear20", partitioned=False)
         >>> [step.parts for step in api(problem, PolicyIterationConfig(), UrgencyRepair(problem.model)).plan]
         [(0,)]
     """
-    parts = partition_of(check_instance("problem", problem, Problem)).num_parts
+    parts = check_instance("problem", problem, Problem).partition.num_parts
     if parts != 1:
-        raise ValueError(
-            f"API is for a problem with a single part, {problem.name!r} has {parts}: make it with partitioned=False"
-        )
+        raise ValueError(f"API is for a problem with a single part, {problem.name!r} has {parts}: take problem.unpartitioned()")
     return PolicyIteration(problem, config, base_policy, [Improve((0,))], **options)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
-import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.record import CSVLogger
@@ -18,14 +17,12 @@ from torchrl_pomdp import __version__
 from torchrl_pomdp.checks import check_callable, check_choice, check_flag, check_instance, check_integer, check_path
 from torchrl_pomdp.collectors import OnLabels
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
-from torchrl_pomdp.envs import PRESETS, Problem, make_problem
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import DamagedFileError, check_claimed, write_json
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
-from torchrl_pomdp.modules import NeverRepairCost, PartitionedValue, Policy
-from torchrl_pomdp.tensor_checks import check_device
-from torchrl_pomdp.trainers.architecture import BASE_POLICIES, partition_of
+from torchrl_pomdp.modules import PartitionedValue, Policy, as_policy
+from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
 from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt, r_t
@@ -49,20 +46,20 @@ class TrainingRun:
     Examples:
         >>> import tempfile
         >>> config = PolicyIterationConfig(1, samples_per_part=40, least_steps=1, validation_states=50)
-        >>> run = TrainingRun("line3", config=config, states=20, online_states=0)
+        >>>         >>> run = TrainingRun(make_problem("line3"), config=config, states=20, online_states=0)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     list(run.carry_out(Path(folder) / "run"))
         ['greedy', 'urgency', 'R-NT of greedy', 'pAPI-NT 1']
     """
 
-    problem: str
-    """Name of the problem, such as linear20."""
+    problem: Problem
+    """The problem; the algorithm API takes it with a single part."""
 
     algorithm: Literal["pAPI-NT", "pAPI-T", "API"] = "pAPI-NT"
     """Policy iteration: pAPI-NT (partitioned), pAPI-T (partitioned, truncated simulations), API (one part)."""
 
-    base: Literal["greedy", "urgency"] = "greedy"
-    """Base policy that is improved first."""
+    base: str = cast(str, None)
+    """Name of the base policy that is improved first; None: the first of the problem's."""
 
     config: PolicyIterationConfig = field(default_factory=PolicyIterationConfig)
     """The numbers of the policy iteration."""
@@ -78,18 +75,21 @@ class TrainingRun:
     """Simulated trajectories of each control in online rollout."""
 
     def __post_init__(self) -> None:
-        check_choice("problem", self.problem, sorted(PRESETS))
+        check_instance("problem", self.problem, Problem)
         check_choice("algorithm", self.algorithm, ALGORITHMS)
-        check_choice("base", self.base, BASE_POLICIES)
+        if self.algorithm == "API":
+            object.__setattr__(self, "problem", self.problem.unpartitioned())
+        base = self.problem.baseline if self.base is None else check_choice("base", self.base, self.problem.base_policies)
+        object.__setattr__(self, "base", base)
         check_instance("config", self.config, PolicyIterationConfig)
         check_integer("states", self.states, 1, MAX_STATES)
         check_integer("online_states", self.online_states, 0, MAX_STATES)
         check_integer("online_trajectories", self.online_trajectories, 1, 10**6)
 
-    def make_problem(self, device: torch.device | str = "cpu") -> Problem:
-        """The problem, partitioned as the algorithm needs it; a ``ValueError`` if there is no such device."""
-        device = check_device("device", device)
-        return make_problem(self.problem, partitioned=self.algorithm != "API", device=device)
+    def to_dict(self) -> dict[str, Any]:
+        """All numbers and names, for JSON; the problem by its name and its spec."""
+        numbers = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return {**numbers, "problem": self.problem.name, "spec": self.problem.spec, "config": asdict(self.config)}
 
     def costs(self, folder: str | PathLike[str], policies: Iterable[str]) -> dict[str, Tensor]:
         """Costs by evaluated policy, from the start states of the evaluation, of a run that was carried out in ``folder``.
@@ -97,7 +97,7 @@ class TrainingRun:
         Raises:
             DamagedFileError: if they are not what this run has written there.
         """
-        path, identity = check_path("folder", folder), _identity(self, self.make_problem())
+        path, identity = check_path("folder", folder), _identity(self)
         found = {}
         for name in policies:
             file = _costs_file(path, name)
@@ -111,7 +111,6 @@ class TrainingRun:
         self,
         folder: str | PathLike[str],
         *,
-        device: torch.device | str = "cpu",
         progress: bool = False,
         report: Report = lambda name, comparison: None,
         on_labels: OnLabels | None = None,
@@ -124,17 +123,17 @@ class TrainingRun:
             folder: folder of the run; new, empty, or that of the same run.
 
         Keyword Args:
-            device: where to compute.
             progress: whether to show progress bars.
-            report: called with the name of a policy and its comparison with greedy as soon as it is known.
+            report: called with the name of a policy and its comparison with the baseline as soon as it is known.
             on_labels: see :class:`PolicyIteration`.
 
         Returns:
-            comparisons with greedy by policy, in the order of the evaluations; online rollout on fewer states.
+            comparisons with the baseline, the problem's first base policy, by policy, in the order of the evaluations; online
+            rollout on fewer states.
 
         Raises:
             TypeError: if something is of the wrong kind.
-            ValueError: if the folder holds something else, or there is no such device.
+            ValueError: if the folder holds something else.
             OSError: if the folder cannot be written, or was deleted while the run went on.
         """
         folder = check_path("folder", folder)
@@ -142,10 +141,9 @@ class TrainingRun:
         check_callable("report", report)
         if on_labels is not None:
             check_callable("on_labels", on_labels)
-        problem = self.make_problem(device)
-        identity = _identity(self, problem)
+        identity = _identity(self)
         path = open_run_folder(folder, identity)
-        execution = _Execution(self, problem, path, identity, progress, report, on_labels)
+        execution = _Execution(self, self.problem, path, identity, progress, report, on_labels)
         try:
             return execution.carry_out()
         except OSError as error:
@@ -165,11 +163,11 @@ class _Execution:
     results: dict[str, Comparison] = field(default_factory=dict)
 
     def carry_out(self) -> dict[str, Comparison]:
-        run, bases = self.run, {name: make(self.problem.model) for name, make in BASE_POLICIES.items()}
+        run, bases = self.run, self.problem.base_policies
         for name, policy in bases.items():
             self._compare(name, policy, run.states)
         base = bases[run.base]
-        self._compare(f"R-NT of {run.base}", r_nt(self.problem, base, trajectories=run.online_trajectories), run.states)
+        self._compare(f"R-NT of {self.run.base}", r_nt(self.problem, base, trajectories=run.online_trajectories), run.states)
         best, policy = self._train(base)
         if run.online_states:
             online = r_nt(self.problem, policy, trajectories=run.online_trajectories)
@@ -180,7 +178,7 @@ class _Execution:
     def _train(self, base: TensorDictModuleBase) -> tuple[str, TensorDictModuleBase]:
         """Carry out the iterations, keep and evaluate their policies; name and policy of the best one."""
         run = self.run
-        best: str = run.base
+        best = run.base
         training = ALGORITHMS[run.algorithm](
             self.problem,
             run.config,
@@ -190,8 +188,8 @@ class _Execution:
             progress=self.progress,
             on_labels=self.on_labels,
         )
-        never = PartitionedValue([NeverRepairCost(self.problem.model)] * partition_of(self.problem).num_parts)
-        untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, base, never)
+        untrained_value = PartitionedValue([self.problem.pessimistic_cost] * self.problem.partition.num_parts)
+        untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, as_policy(base, self.problem.model), untrained_value)
         if not (self.folder / "best.pt").is_file():
             self._keep("best.pt", untrained)
         summaries = []
@@ -229,10 +227,11 @@ class _Execution:
 
     @cached_property
     def _baseline(self) -> Tensor:
-        return self._costs("greedy", BASE_POLICIES["greedy"](self.problem.model), self.run.states)
+        name = self.problem.baseline
+        return self._costs(name, self.problem.base_policies[name], self.run.states)
 
     def _compare(self, name: str, policy: Policy, states: int) -> None:
-        """Add a policy's comparison with greedy, and bring the folder's metrics up to date."""
+        """Add a policy's comparison with the baseline, and bring the folder's metrics up to date."""
         costs = self._costs(name, policy, min(states, self.run.states))
         self.results[name] = compare(costs, self._baseline[: costs.numel()])
         self.check_folder()
@@ -251,7 +250,7 @@ class _Execution:
             self.problem.start,
             num_states=states,
             seed=EVALUATION_SEED,
-            terminal_cost=NeverRepairCost(self.problem.model),
+            terminal_cost=self.problem.pessimistic_cost,
             progress=self.progress,
             name=f"evaluate {name}",
         ).cpu()
@@ -260,10 +259,11 @@ class _Execution:
         return costs
 
 
-def _identity(run: TrainingRun, problem: Problem) -> dict[str, Any]:
+def _identity(run: TrainingRun) -> dict[str, Any]:
     """All that decides the results of a run, as JSON."""
-    bases = {name: digest(make(problem.model)) for name, make in BASE_POLICIES.items()}
-    return {**asdict(run), "version": __version__, "problem_digest": problem_digest(problem), "base_policies": bases}
+    bases = {name: digest(policy) for name, policy in run.problem.base_policies.items()}
+    own = {"version": __version__, "problem_digest": problem_digest(run.problem), "base_policies": bases}
+    return {**run.to_dict(), **own}
 
 
 def _costs_file(folder: Path, policy: str) -> Path:

@@ -6,6 +6,7 @@ TorchRL call :class:`~torchrl_pomdp.envs.BeliefEnv`, a thin skin over it.
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -16,80 +17,16 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_number, check_sequence, shown
+from torchrl_pomdp.envs.names import name_of, number_of
 from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.noise import fingerprint
 from torchrl_pomdp.tensor_checks import check_keys
 
-__all__ = ["BeliefModel", "StateGenerator", "inverse_cdf", "put_rows", "take_rows"]
+__all__ = ["BeliefModel", "StateGenerator", "generated"]
 
 StateGenerator = Callable[[Tensor], TensorDictBase]
 """Distribution of feature states: maps int64 keys ``[*B]`` to feature states ``[*B]``, the same key to the same state."""
-
-
-def inverse_cdf(probs: Tensor, noise: Tensor, dim: int = -1) -> Tensor:
-    """Index drawn from ``probs`` by inverting its distribution function at ``noise``.
-
-    Args:
-        probs: nonnegative weights with positive sum along ``dim``.
-        noise: uniforms in [0, 1) of ``probs``' shape without ``dim``.
-        dim: the dimension that is drawn from.
-
-    Returns:
-        int64 index of ``noise``'s shape; an index of probability zero is never returned.
-
-    Examples:
-        >>> inverse_cdf(torch.tensor([0.0, 0.25, 0.75, 0.0]).expand(3, 4), torch.tensor([0.0, 0.25, 0.999])).tolist()
-        [1, 2, 2]
-    """
-    cumulative = probs.cumsum(dim)
-    # Scaling by the rounded total keeps the threshold below it, so trailing zeros are not reached.
-    threshold = (noise * cumulative.select(dim, -1)).unsqueeze(dim)
-    return (cumulative.narrow(dim, 0, probs.shape[dim] - 1) <= threshold).sum(dim)
-
-
-def take_rows(y: TensorDictBase, index: Tensor) -> TensorDictBase:
-    """Rows ``index`` (int64 ``[M]``) of the flat batch ``y`` ``[N]``, each entry in the memory layout that it has.
-
-    Indexing ``y[index]`` would turn entries whose batch dimension is innermost, such as beliefs kept as planes, into
-    row-major ones, and every later step would pay for turning them back.
-
-    Examples:
-        >>> y = TensorDict({"belief": torch.rand(3, 5).T}, [5])
-        >>> take_rows(y, torch.tensor([4, 0]))["belief"].stride()
-        (1, 2)
-    """
-
-    def take(leaf: Tensor) -> Tensor:
-        if _batch_innermost(leaf):
-            planes = leaf.movedim(0, -1)
-            return planes.flatten(0, -2).index_select(1, index).view(*planes.shape[:-1], -1).movedim(-1, 0)
-        return leaf.index_select(0, index)
-
-    return TensorDict({key: take(leaf) for key, leaf in y.items()}, batch_size=index.shape, device=y.device)
-
-
-def put_rows(y: TensorDictBase, index: Tensor, rows: TensorDictBase) -> TensorDictBase:
-    """The flat batch ``y`` ``[N]`` with ``rows`` ``[M]`` in the places ``index`` (int64 ``[M]``); ``y`` is left alone.
-
-    Examples:
-        >>> y = TensorDict({"belief": torch.zeros(3, 5).T}, [5])
-        >>> put_rows(y, torch.tensor([4]), TensorDict({"belief": torch.ones(1, 3)}, [1]))["belief"].sum(-1).tolist()
-        [0.0, 0.0, 0.0, 0.0, 3.0]
-    """
-
-    def put(leaf: Tensor, new: Tensor) -> Tensor:
-        if _batch_innermost(leaf):
-            planes = leaf.movedim(0, -1)
-            result = planes.flatten(0, -2).index_copy(1, index, new.movedim(0, -1).flatten(0, -2))
-            return result.view(planes.shape).movedim(-1, 0)
-        return leaf.index_copy(0, index, new)
-
-    changed = {key: put(leaf, rows.get(key)) for key, leaf in y.items()}
-    return TensorDict(changed, batch_size=y.batch_size, device=y.device)
-
-
-def _batch_innermost(leaf: Tensor) -> bool:
-    return leaf.ndim > 1 and leaf.stride(0) == 1
 
 
 class BeliefModel(nn.Module, ABC):
@@ -110,6 +47,9 @@ class BeliefModel(nn.Module, ABC):
         noise_dim: uniforms consumed by one sampled step.
         discount: :math:`\alpha` in (0, 1).
         partition: the partition whose part index is a feature, or None.
+        max_cost: a bound of :math:`|\hat g|` where one is known, or None.
+        control_names: names of the controls, or None.
+        observation_names: names of the observations, or None.
 
     A model stays on the device and in the type it was built with; ``to``, ``double`` and the like are refused.
 
@@ -126,13 +66,44 @@ class BeliefModel(nn.Module, ABC):
     num_controls: int
     num_observations: int
     noise_dim: int = 1
+    max_cost: float | None = None
+    control_names: tuple[str, ...] | None = None
+    observation_names: tuple[str, ...] | None = None
 
     def __init__(self, discount: float, partition: Partition | None = None) -> None:
         super().__init__()
         self.discount = check_number("discount", discount, "(0, 1)")
         if partition is not None:
-            check_instance("partition", partition, Partition).check()
+            self.check_partition(partition)
         self.partition = partition
+
+    def check_partition(self, partition: Partition) -> None:
+        """Raise unless a partition is one, and one for this model (subclasses may ask for more).
+
+        Raises:
+            TypeError: if it is none, or its names or stages are of the wrong kind.
+            ValueError: by :meth:`Partition.check`.
+        """
+        check_instance("partition", partition, Partition).check()
+
+    def with_partition(self, partition: Partition) -> BeliefModel:
+        """The same model, tables shared, with another partition.
+
+        Raises:
+            TypeError: by :meth:`check_partition`.
+            ValueError: by :meth:`check_partition`.
+
+        Examples:
+            >>> from torchrl_pomdp.envs import SinglePart
+            >>> from torchrl_pomdp.problems import make_problem
+            >>> make_problem("linear20").model.with_partition(SinglePart()).partition.names
+            ('all',)
+        """
+        self.check_partition(partition)
+        other = copy.copy(self)
+        other._modules = dict(self._modules)
+        other.partition = partition
+        return other
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> BeliefModel:
         """Refuse what would move or convert tensors: tables that are no buffers would stay behind."""
@@ -331,8 +302,9 @@ class BeliefModel(nn.Module, ABC):
             ValueError: if it gives another batch than the keys', or what is no feature state of this model.
 
         Examples:
-            >>> from torchrl_pomdp.envs import FixedBelief, tiger
-            >>> tiger().drawn(FixedBelief(torch.tensor([0.5, 0.5])), torch.arange(3))["belief"].shape
+            >>> from torchrl_pomdp.envs import FixedBelief
+            >>> from torchrl_pomdp.problems import tiger
+            >>> tiger().model.drawn(FixedBelief(torch.tensor([0.5, 0.5])), torch.arange(3))["belief"].shape
             torch.Size([3, 2])
         """
         y = generated(generator, keys, name)
@@ -343,6 +315,34 @@ class BeliefModel(nn.Module, ABC):
                 result.set(key, leaf.to(self.dtype))
         self.check_state(result)
         return result
+
+    # ---- what a real robot does and reports, see torchrl_pomdp.controller ---------------------------------------------
+
+    def shown_control(self, u: int) -> tuple[str, ...]:
+        """Names of control ``u``, one for each robot; its number where the model has no names."""
+        return (name_of(u, self.control_names),)
+
+    def control_number(self, control: Any) -> int:
+        """The control that is given by number or name; raises as :func:`~torchrl_pomdp.envs.names.number_of` does."""
+        return number_of("control", control, self.control_names, self.num_controls)
+
+    def condition(self, y: TensorDictBase, observation: Any) -> TensorDictBase:
+        """The state ``y``, of batch ``()``, after a look before the first control. Most models have none and refuse."""
+        raise ValueError(f"observation must wait for a control: {type(self).__name__} sees nothing before the first one")
+
+    def follow(self, y: TensorDictBase, u: Tensor, observation: Any) -> TensorDictBase:
+        """F(y, u, z) of a single state, of batch ``()``, for a reported observation: a number or a name.
+
+        Raises:
+            TypeError: if the observation is neither.
+            ValueError: if it is unknown, or impossible after this control.
+        """
+        z = number_of("observation", observation, self.observation_names, self.num_observations)
+        possible = (self.observation_probs(y, u) > 0).nonzero().flatten().tolist()
+        if z not in possible:
+            names = ", ".join(name_of(each, self.observation_names) for each in possible)
+            raise ValueError(f"observation must be possible after this control, one of {names}; got {observation!r}")
+        return self.estimator(y, u, torch.tensor(z, device=self.device))
 
     def describe(self) -> str:
         """One line: what the model is, with the numbers of controls and observations."""

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_pomdp.envs import PRESETS, make_problem
+from torchrl_pomdp.problems import PRESETS, make_problem
 
 # States, controls, observations and the model's own description of them.
 SIZES = {

@@ -6,9 +6,10 @@ import pytest
 import torch
 from _oracles import random_states, small_model
 
-from torchrl_pomdp.envs import REPAIR, Graph, grid, line, make_problem
+from torchrl_pomdp.envs.repair import REPAIR, Graph, grid, line
 from torchrl_pomdp.evaluation import compare, discounted_costs
-from torchrl_pomdp.modules import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.problems import make_problem
 
 
 def urgency_by_hand(model, belief, places):

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs import Graph, RepairModel, damage_chain, grid, line, make_problem
+from torchrl_pomdp.envs.repair import Graph, RepairModel, damage_chain, grid, line
+from torchrl_pomdp.problems import make_problem
 
 TRIANGLE = Graph.from_edges("triangle with a tail", 4, [(0, 1), (1, 2), (2, 0), (2, 3)])
 

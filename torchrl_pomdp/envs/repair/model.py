@@ -20,10 +20,12 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
-from torchrl_pomdp.envs.belief import BeliefModel, inverse_cdf
-from torchrl_pomdp.envs.chains import checked_chain, checked_costs, drifts, off_diagonals, overflowing_levels
-from torchrl_pomdp.envs.graphs import Graph
-from torchrl_pomdp.envs.partition import Partition, RepairPartition, location_costs
+from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.envs.repair.chains import checked_chain, checked_costs, drifts, off_diagonals, overflowing_levels
+from torchrl_pomdp.envs.repair.graphs import Graph
+from torchrl_pomdp.envs.repair.partition import RepairPartition, location_costs
+from torchrl_pomdp.envs.repair.robots import Robots, digits
+from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.sums import multiply_first, sum_first
 from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype
 
@@ -36,7 +38,7 @@ REPAIR = 0
 _MAX_CONTROLS, _MAX_OBSERVATIONS = 1 << 16, 1 << 31
 
 
-class RepairModel(BeliefModel):
+class RepairModel(Robots):
     r"""Belief model of the repair problem: L locations with K damage levels, R robots.
 
     Core entries: ``"belief"`` float ``[*B, L, K]`` and ``"location"`` int64 ``[*B, R]``. The joint control is the number
@@ -63,7 +65,7 @@ class RepairModel(BeliefModel):
         ValueError: if an argument is out of range, or the partition is of another graph or other levels.
 
     Examples:
-        >>> from torchrl_pomdp.envs import damage_chain, line
+        >>> from torchrl_pomdp.envs.repair import damage_chain, line
         >>> model = RepairModel(line(20), damage_chain((0, 0.02, 0.03, 0.05)), (0, 0.1, 1, 10, 100), 0.99)
         >>> model.describe()
         'line of 20, 1 robot: 1.9e+15 states, 3 controls, 5 observations, discount 0.99'
@@ -90,7 +92,7 @@ class RepairModel(BeliefModel):
         dtype: torch.dtype = torch.float32,
         device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(discount, partition)
+        super().__init__(discount)
         self.graph = check_instance("graph", graph, Graph)
         dtype, device = check_dtype("dtype", dtype), check_device("device", device)
         chain = checked_chain(chain)
@@ -109,8 +111,9 @@ class RepairModel(BeliefModel):
         self.level_zero_absorbing = bool(chain[0, 0] == 1)
         self._normalise = drifts(chain, dtype)
         self._register_tables(chain.to(dtype), costs, device)
-        if isinstance(partition, RepairPartition):
-            partition.check_fits(self.num_locations, self.num_levels, self.device)
+        if partition is not None:
+            self.check_partition(partition)
+        self.partition = partition
 
     def _register_tables(self, chain: Tensor, costs: Tensor, device: torch.device) -> None:
         nodes = torch.arange(self.num_locations).unsqueeze(-1)
@@ -166,6 +169,12 @@ class RepairModel(BeliefModel):
         super().check_state(y)
         check_distributions("entry 'belief' of y", y.get("belief"))
 
+    def check_partition(self, partition: Partition) -> None:
+        """Raise unless a partition is one, and one for this graph and these levels; see :meth:`BeliefModel.check_partition`."""
+        super().check_partition(partition)
+        if isinstance(partition, RepairPartition):
+            partition.check_fits(self.num_locations, self.num_levels, self.device)
+
     def describe(self) -> str:
         """Graph, robots, and the numbers of states, controls and observations."""
         mantissa, exponent = _scientific(self.num_states)
@@ -176,17 +185,6 @@ class RepairModel(BeliefModel):
         )
 
     # ---- controls ------------------------------------------------------------------------------------------------
-
-    def split_controls(self, u: Tensor) -> Tensor:
-        """Robots' controls ``[*B, R]`` of joint controls ``[*B]``."""
-        return _digits(u, self.num_robot_controls, self.num_robots)
-
-    def join_controls(self, controls: Tensor) -> Tensor:
-        """Joint controls ``[*B]`` of robots' controls ``[*B, R]``."""
-        joint = controls[..., 0]
-        for robot in range(1, self.num_robots):
-            joint = joint * self.num_robot_controls + controls[..., robot]
-        return joint
 
     def action_mask(self, y: TensorDictBase) -> Tensor:
         """Legal joint controls, bool ``[*B, U]``: every robot's control is legal for it."""
@@ -215,14 +213,14 @@ class RepairModel(BeliefModel):
         """Joint distribution of the robots' observed levels, ``[*B, K^R]``."""
         location, repaired = self._move(y, u)
         columns = self._columns(self._planes(y), location, repaired)
-        digits = _digits(torch.arange(self.num_observations, device=self.device), self.num_levels, self.num_robots)
+        every = digits(torch.arange(self.num_observations, device=self.device), self.num_levels, self.num_robots)
         joint = torch.ones(self.num_observations, location.shape[-1], dtype=self.dtype, device=self.device)
         for robot, column in enumerate(columns):
-            factor = column[digits[:, robot]]
+            factor = column[every[:, robot]]
             for other in range(robot):
                 # Robots that stand together see the same level: the later one's observation is certain.
                 together = location[robot] == location[other]
-                same = (digits[:, robot] == digits[:, other]).unsqueeze(-1).to(self.dtype)
+                same = (every[:, robot] == every[:, other]).unsqueeze(-1).to(self.dtype)
                 factor = torch.where(together, same, factor)
             joint = joint * factor
         return joint.movedim(0, -1).reshape(*y.batch_size, self.num_observations)
@@ -236,7 +234,7 @@ class RepairModel(BeliefModel):
         self.check_controls(y, u)
         self.check_observations(y, z)
         location, repaired = self._move(y, u)
-        levels = _digits(z.reshape(-1), self.num_levels, self.num_robots).T
+        levels = digits(z.reshape(-1), self.num_levels, self.num_robots).T
         planes = self._degrade_planes(self._planes(y))
         self._refuse_impossible(z, self._possible(planes, location, repaired, levels).view(y.batch_size))
         return self._successor(y, self._set_levels(planes, location, levels), location)
@@ -278,7 +276,7 @@ class RepairModel(BeliefModel):
     def _move(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor]:
         """For each robot ``[R, N]`` its new location and whether it repairs there."""
         origin = y.get("location").reshape(-1, self.num_robots).T
-        controls = _digits(u.reshape(-1), self.num_robot_controls, self.num_robots).T
+        controls = digits(u.reshape(-1), self.num_robot_controls, self.num_robots).T
         return self.destinations.flatten()[origin * self.num_robot_controls + controls], controls == REPAIR
 
     def _columns(self, planes: Tensor, location: Tensor, repaired: Tensor) -> list[Tensor]:
@@ -378,14 +376,6 @@ class RepairModel(BeliefModel):
         shape = y.batch_size
         belief = planes.permute(2, 0, 1).reshape(*shape, self.num_locations, self.num_levels)
         return self.successor(y, belief=belief, location=location.T.reshape(*shape, self.num_robots))
-
-
-def _digits(number: Tensor, base: int, count: int) -> Tensor:
-    """Base-``base`` digits ``[*B, count]`` of ``number`` ``[*B]``, most significant first."""
-    if count == 1:
-        return number.unsqueeze(-1)
-    powers = base ** torch.arange(count - 1, -1, -1, device=number.device)
-    return number.unsqueeze(-1) // powers % base
 
 
 def _scientific(number: int) -> tuple[float, int]:

@@ -17,8 +17,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance
-from torchrl_pomdp.envs.graphs import Graph
-from torchrl_pomdp.envs.repair import RepairModel
+from torchrl_pomdp.envs.repair.graphs import Graph
+from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["Symmetry", "symmetries"]
@@ -76,7 +76,7 @@ def symmetries(model: RepairModel) -> list[Symmetry]:
         TypeError: if it is no repair model.
 
     Examples:
-        >>> from torchrl_pomdp.envs import make_problem
+        >>> from torchrl_pomdp.problems import make_problem
         >>> [len(symmetries(make_problem(name).model)) for name in ("linear20", "grid5x4", "grid6x6", "two_robots20")]
         [2, 4, 8, 4]
     """

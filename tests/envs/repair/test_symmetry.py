@@ -10,8 +10,9 @@ import pytest
 import torch
 from _oracles import random_states, small_model
 
-from torchrl_pomdp.envs import Graph, RepairPartition, grid, line, symmetries
-from torchrl_pomdp.modules import GreedyRepair, NeverRepairCost, RolloutPolicy
+from torchrl_pomdp.envs.repair import Graph, RepairPartition, grid, line, symmetries
+from torchrl_pomdp.modules import RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
 
 CASES = [(line(4), 1, 2), (grid(3, 2), 1, 4), (grid(2, 2), 1, 8), (line(3), 2, 4), (grid(2, 1), 3, 12)]
 
@@ -52,7 +53,8 @@ def test_no_two_are_the_same_and_the_identity_comes_first():
 
 def test_graphs_without_a_plan_have_only_what_their_edges_allow():
     fork = Graph.from_edges("fork", 4, [(0, 1), (1, 2), (1, 3)])
-    assert len(symmetries(small_model(fork))) == 1
+    # Its two short arms may be exchanged; places from distances show it.
+    assert [s.locations.tolist() for s in symmetries(small_model(fork))] == [[0, 1, 2, 3], [0, 1, 3, 2]]
 
 
 def by_trying(graph):

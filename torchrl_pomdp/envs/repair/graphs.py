@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_integer, check_text, shown
+from torchrl_pomdp.checks import check_integer, check_number, check_text, shown
+from torchrl_pomdp.envs.repair.layout import places
 from torchrl_pomdp.tensor_checks import check_tensor
 
 __all__ = ["MAX_LOCATIONS", "Graph", "grid", "line"]
@@ -23,14 +24,17 @@ class Graph:
     """An undirected, connected graph, with one control slot per direction of movement.
 
     Control 0 of a robot is *repair*; control ``1 + s`` moves along slot ``s``. A graph is made from its slot table, here or by
-    :meth:`from_slots`, or from its edges by :meth:`from_edges`; the last two attributes follow.
+    :meth:`from_slots`, from its edges by :meth:`from_edges`, or from a graph of NetworkX by :meth:`from_networkx`; the last two
+    attributes follow. A graph that is given no coordinates gets them from its distances, see
+    :func:`~torchrl_pomdp.envs.repair.layout.places`: left is then what is nearer to one end of the graph, right to the other.
 
     Attributes:
         name: how the graph calls itself in descriptions.
         neighbours: int64 ``[L, S]``; node reached from a node along a slot, or -1 where there is no edge.
         slot_names: the ``S`` names of the directions.
         columns: float32 ``[L]``; the horizontal coordinate, for drawing and for "left" and "right" damage.
-        rows: float32 ``[L]``; the vertical coordinate, for drawing.
+        rows: float32 ``[L]``; the vertical coordinate, for drawing. Columns or rows alone: the others are zero.
+        location_names: the ``L`` names of the locations; by default their numbers.
         distances: int64 ``[L, L]``; number of moves between two nodes.
         first_controls: int64 ``[L, L]``; the robot control that starts a shortest path from a node (first index) to a
             node (second index), ties to the lower control; 0 (repair) on the diagonal.
@@ -48,8 +52,9 @@ class Graph:
     name: str
     neighbours: Tensor
     slot_names: tuple[str, ...]
-    columns: Tensor
-    rows: Tensor
+    columns: Tensor = None  # type: ignore[assignment]
+    rows: Tensor = None  # type: ignore[assignment]
+    location_names: tuple[str, ...] = ()
     distances: Tensor = field(init=False)
     first_controls: Tensor = field(init=False)
 
@@ -57,17 +62,13 @@ class Graph:
         check_text("name", self.name)
         table = _slot_table(self.neighbours)
         size, num_slots = table.shape
-        names = tuple(_sequence("slot_names", self.slot_names))
-        if len(names) != num_slots:
-            raise ValueError(f"slot_names must hold {num_slots} names, one for each slot of neighbours, got {len(names)}")
-        for slot, slot_name in enumerate(names):
-            check_text(f"slot_names[{slot}]", slot_name)
-        columns, rows = (check_tensor(n, c, (size,)) for n, c in (("columns", self.columns), ("rows", self.rows)))
-        columns, rows = (check_tensor(n, c.float()) for n, c in (("columns", columns), ("rows", rows)))
-        _check_distinct(columns, rows)
+        names = _names("slot_names", self.slot_names, num_slots)
+        called = _sequence("location_names", self.location_names) or [str(location) for location in range(size)]
+        called = _names("location_names", called, size)
         distances = _distances(table)
+        columns, rows = _coordinates(self.columns, self.rows, distances)
         derived = {"distances": distances, "first_controls": _first_controls(table, distances)}
-        given = {"neighbours": table, "slot_names": names, "columns": columns, "rows": rows}
+        given = {"neighbours": table, "slot_names": names, "columns": columns, "rows": rows, "location_names": called}
         for key, value in {**given, **derived}.items():
             object.__setattr__(self, key, value)
 
@@ -77,8 +78,9 @@ class Graph:
         name: str,
         neighbours: Sequence[Sequence[int]],
         slot_names: Sequence[str],
-        columns: Sequence[float],
-        rows: Sequence[float],
+        columns: Sequence[float] | None = None,
+        rows: Sequence[float] | None = None,
+        location_names: Sequence[str] = (),
     ) -> Graph:
         """Build a graph from its slot table ``neighbours[node][slot]`` (-1 for no edge), in plain sequences.
 
@@ -90,7 +92,7 @@ class Graph:
             >>> Graph.from_slots("pipe", [[1], [0]], ["across"], [0, 1], [0, 0]).distances.tolist()
             [[0, 1], [1, 0]]
         """
-        values: Any = (neighbours, slot_names, columns, rows)
+        values: Any = (neighbours, slot_names, columns, rows, location_names)
         return cls(name, *values)
 
     @classmethod
@@ -102,6 +104,7 @@ class Graph:
         *,
         columns: Sequence[float] | None = None,
         rows: Sequence[float] | None = None,
+        location_names: Sequence[str] = (),
     ) -> Graph:
         """Build an arbitrary undirected graph from pairs of 0-based locations; slots are the sorted neighbours.
 
@@ -111,8 +114,9 @@ class Graph:
             edges: pairs of different locations.
 
         Keyword Args:
-            columns: horizontal coordinates; None: the numbers of the locations.
-            rows: vertical coordinates; None: zeros.
+            columns: horizontal coordinates.
+            rows: vertical coordinates. Without any, both follow from the distances.
+            location_names: names of the locations; by default their numbers.
 
         Raises:
             TypeError: if an argument is of the wrong kind, such as a location that is no integer.
@@ -138,9 +142,49 @@ class Graph:
             adjacent[b].add(a)
         degree = max(len(nodes) for nodes in adjacent)
         table = [sorted(nodes) + [-1] * (degree - len(nodes)) for nodes in adjacent]
-        columns = list(range(num_locations)) if columns is None else columns
-        rows = [0] * num_locations if rows is None else rows
-        return cls.from_slots(name, table, [f"neighbour {s}" for s in range(degree)], columns, rows)
+        return cls.from_slots(name, table, [f"neighbour {s}" for s in range(degree)], columns, rows, location_names)
+
+    @classmethod
+    def from_networkx(
+        cls, graph: Any, *, name: str | None = None, positions: Mapping[Any, Sequence[float]] | None = None
+    ) -> Graph:
+        """Build a graph from one of NetworkX, or from anything with ``nodes`` and ``edges``; nodes may be any objects.
+
+        Locations are numbered in the order of the nodes, and called what the nodes are as texts.
+
+        Args:
+            graph: the undirected graph.
+
+        Keyword Args:
+            name: how the graph calls itself; None: its number of locations.
+            positions: column and row of every node; None: both follow from the distances.
+
+        Raises:
+            TypeError: if it is no graph, or an argument is of the wrong kind.
+            ValueError: if it is directed, nodes are the same as texts, a node has no position, or by :meth:`from_edges`.
+
+        Examples:
+            >>> import networkx
+            >>> plant = networkx.Graph([("pump", "tank"), ("tank", "valve")])
+            >>> graph = Graph.from_networkx(plant)
+            >>> graph.location_names, graph.columns.tolist()
+            (('pump', 'tank', 'valve'), [0.0, 1.0, 2.0])
+        """
+        if not isinstance(getattr(graph, "nodes", None), Iterable) or not isinstance(getattr(graph, "edges", None), Iterable):
+            raise TypeError(f"graph must have nodes and edges, as those of NetworkX have, got {shown(graph)}")
+        if getattr(graph, "is_directed", bool)():
+            raise ValueError(f"graph must be undirected, got {shown(graph)}: use its to_undirected()")
+        nodes = list(graph.nodes)
+        number = {node: location for location, node in enumerate(nodes)}
+        columns, rows = (None, None) if positions is None else _positions(positions, nodes)
+        return cls.from_edges(
+            f"graph of {len(nodes)}" if name is None else name,
+            len(nodes),
+            [(number[first], number[second]) for first, second, *_ in graph.edges],
+            columns=columns,
+            rows=rows,
+            location_names=[str(node) for node in nodes],
+        )
 
     @property
     def num_locations(self) -> int:
@@ -227,6 +271,43 @@ def _slot_table(neighbours: Any) -> Tensor:
         if back is not None:
             raise ValueError(f"neighbours leads from location {node} to {back} but not back: every edge must go both ways")
     return torch.tensor([list(map(int, row)) for row in rows], dtype=torch.int64)
+
+
+def _names(name: str, value: Any, count: int) -> tuple[str, ...]:
+    """So many different names."""
+    names = tuple(_sequence(name, value))
+    if len(names) != count:
+        raise ValueError(f"{name} must hold {count} names, got {len(names)}")
+    for i, each in enumerate(names):
+        check_text(f"{name}[{i}]", each)
+    if len(set(names)) < count:
+        raise ValueError(f"{name} must hold different names, got {shown(names)}")
+    return names
+
+
+def _coordinates(columns: Any, rows: Any, distances: Tensor) -> tuple[Tensor, Tensor]:
+    """Coordinates, from the distances where there are none; raises unless every location has a place of its own."""
+    if columns is None and rows is None:
+        return places(distances)
+    size = len(distances)
+    given = [("columns", [0] * size if columns is None else columns), ("rows", [0] * size if rows is None else rows)]
+    across, down = (check_tensor(n, check_tensor(n, c, (size,)).float()) for n, c in given)
+    _check_distinct(across, down)
+    return across, down
+
+
+def _positions(positions: Any, nodes: Sequence[Any]) -> tuple[list[float], list[float]]:
+    """Columns and rows of the nodes."""
+    if not isinstance(positions, Mapping):
+        raise TypeError(f"positions must map nodes to column and row, got {shown(positions)}")
+    pairs = []
+    for node in nodes:
+        place = positions.get(node, ())
+        pair = _sequence("position", place.tolist() if hasattr(place, "tolist") else place)
+        if len(pair) != 2:
+            raise ValueError(f"positions must hold column and row of every node, got {shown(pair)} for {shown(node)}")
+        pairs.append([check_number(f"position of {shown(node)}", number) for number in pair])
+    return [column for column, _ in pairs], [row for _, row in pairs]
 
 
 def _check_distinct(columns: Tensor, rows: Tensor) -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_pomdp.envs import Graph, grid, line
+from torchrl_pomdp.envs.repair import Graph, grid, line
 
 
 @pytest.mark.parametrize("graph", [line(7), grid(4, 3), Graph.from_edges("ring", 5, [(i, (i + 1) % 5) for i in range(5)])])

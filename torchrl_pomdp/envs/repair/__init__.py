@@ -1,0 +1,25 @@
+"""The sequential repair of pipelines (paper, Section VI)."""
+
+from torchrl_pomdp.envs.repair.chains import damage_chain
+from torchrl_pomdp.envs.repair.generators import CalibratedStart, RandomState, UniformStart
+from torchrl_pomdp.envs.repair.graphs import Graph, grid, line
+from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
+from torchrl_pomdp.envs.repair.partition import RepairPartition
+from torchrl_pomdp.envs.repair.rendering import trajectory_figure
+from torchrl_pomdp.envs.repair.symmetry import Symmetry, symmetries
+
+__all__ = [
+    "REPAIR",
+    "CalibratedStart",
+    "Graph",
+    "RandomState",
+    "RepairModel",
+    "RepairPartition",
+    "Symmetry",
+    "UniformStart",
+    "damage_chain",
+    "grid",
+    "line",
+    "symmetries",
+    "trajectory_figure",
+]

@@ -1,0 +1,168 @@
+"""Several robots as one: joint controls, and what each of them reports (paper, Section VI-A)."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from numbers import Integral
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_pomdp.checks import check_integer, shown
+from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.names import number_of
+from torchrl_pomdp.envs.repair.graphs import Graph
+
+__all__ = ["Robots", "digits"]
+
+
+class Robots(BeliefModel):
+    """The robots of a :class:`~torchrl_pomdp.envs.repair.RepairModel`: their controls, and observations that may be missing.
+
+    The joint control is the number whose base-A digits are the robots' controls, robot 0 first. An observation is the damage
+    level that a robot sees where it stands: one for each robot, or None from a robot that does not report; a single robot's
+    may stand alone.
+
+    Attributes:
+        graph: where the robots move.
+        num_robots: R.
+        num_robot_controls: A, the number of controls of one robot.
+        num_levels: K.
+    """
+
+    graph: Graph
+    num_robots: int
+    num_robot_controls: int
+    num_levels: int
+
+    def split_controls(self, u: Tensor) -> Tensor:
+        """Robots' controls ``[*B, R]`` of joint controls ``[*B]``."""
+        return digits(u, self.num_robot_controls, self.num_robots)
+
+    def join_controls(self, controls: Tensor) -> Tensor:
+        """Joint controls ``[*B]`` of robots' controls ``[*B, R]``."""
+        joint = controls[..., 0]
+        for robot in range(1, self.num_robots):
+            joint = joint * self.num_robot_controls + controls[..., robot]
+        return joint
+
+    # ---- what real robots do and report --------------------------------------------------------------------------------
+
+    def shown_control(self, u: int) -> tuple[str, ...]:
+        """Names of the robots' controls, such as ``("repair", "left")``."""
+        return tuple(self.graph.control_names[c] for c in self.split_controls(torch.tensor(u)).tolist())
+
+    def control_number(self, control: Any) -> int:
+        """The joint control that is given by its number, or by a number or name for each robot; of one robot without a list.
+
+        Raises:
+            TypeError: if it is of another kind.
+            ValueError: if there is no such control, or not one for each robot.
+        """
+        if isinstance(control, Integral):
+            return check_integer("control", control, 0, self.num_controls - 1)
+        each = self._each("control", control)
+        names, count = self.graph.control_names, self.num_robot_controls
+        numbers = [number_of(f"control of robot {robot}", given, names, count) for robot, given in enumerate(each)]
+        return int(self.join_controls(torch.tensor(numbers)))
+
+    def condition(self, y: TensorDictBase, observation: Any) -> TensorDictBase:
+        """The state ``y``, of batch ``()``, after the robots have looked where they stand, without a control.
+
+        Raises:
+            TypeError: if an observation is no level.
+            ValueError: if it is unknown, or impossible in ``y``.
+        """
+        levels = self._levels_of(observation)
+        location = y.get("location").reshape(-1, 1)
+        return self._successor(y, self._report(self._planes(y).clone(), location, levels, {}), location)
+
+    def follow(self, y: TensorDictBase, u: Tensor, observation: Any) -> TensorDictBase:
+        """The next state for a single state, of batch ``()``, given the levels that some of the robots report.
+
+        Where no robot reports from, the belief is the prediction; a location that is repaired is known to be intact.
+
+        Raises:
+            TypeError: if an observation is no level.
+            ValueError: if it is unknown, or impossible after this control.
+        """
+        levels = self._levels_of(observation)
+        location, repaired = self._move(y, u)
+        fixed = {place: 0 for place, done in zip(location[:, 0].tolist(), repaired[:, 0].tolist(), strict=True) if done}
+        planes = self._degrade_planes(self._planes(y))
+        return self._successor(y, self._report(planes, location, levels, fixed), location)
+
+    def _each(self, what: str, given: Any) -> Sequence[Any]:
+        """What is given for each robot; for one robot it may stand alone."""
+        several = isinstance(given, Sequence) and not isinstance(given, (str, bytes))
+        if not several and self.num_robots == 1:
+            return [given]
+        if not several:
+            raise TypeError(f"{what} must be a sequence, one for each of the {self.num_robots} robots, got {shown(given)}")
+        if len(given) != self.num_robots:
+            raise ValueError(f"{what} must hold one for each of the {self.num_robots} robots, got {shown(given)}")
+        return given
+
+    def _levels_of(self, observation: Any) -> list[int | None]:
+        """One level or None for each robot; None alone: no robot reports."""
+        each = [None] * self.num_robots if observation is None else self._each("observation", observation)
+        names = self.observation_names
+        return [
+            None if level is None else number_of(f"observation of robot {robot}", level, names, self.num_levels)
+            for robot, level in enumerate(each)
+        ]
+
+    def _report(self, planes: Tensor, location: Tensor, levels: Sequence[int | None], fixed: dict[int, int]) -> Tensor:
+        """The planes ``[L, K, 1]`` of a state once levels are known, written into: those in ``fixed``, then what robots see."""
+        for place, level in fixed.items():
+            planes[place, :, 0] = self._certain(planes, level)
+        for robot, (place, seen) in enumerate(zip(location[:, 0].tolist(), levels, strict=True)):
+            if seen is None:
+                continue
+            possible = (planes[place, :, 0] > 0).nonzero().flatten().tolist()
+            if seen not in possible:
+                where = self.graph.location_names[place]
+                raise ValueError(
+                    f"observation of robot {robot} must be possible: level {seen} at location {where} is not, "
+                    f"what is known allows levels {possible}"
+                )
+            # Robots that stand together see the same level: the next one is held to this.
+            planes[place, :, 0] = self._certain(planes, seen)
+        return planes
+
+    def _certain(self, planes: Tensor, level: int) -> Tensor:
+        return (torch.arange(self.num_levels, device=planes.device) == level).to(planes.dtype)
+
+    # ---- what the model computes ---------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _planes(self, y: TensorDictBase) -> Tensor:
+        """Belief of ``y`` as planes ``[L, K, N]``."""
+
+    @abstractmethod
+    def _move(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor]:
+        """For each robot ``[R, N]`` its new location and whether it repairs there."""
+
+    @abstractmethod
+    def _degrade_planes(self, planes: Tensor) -> Tensor:
+        """Planes one step of the chain later, as a new tensor."""
+
+    @abstractmethod
+    def _successor(self, y: TensorDictBase, planes: Tensor, location: Tensor) -> TensorDictBase:
+        """The feature state of planes ``[L, K, N]`` and locations ``[R, N]``."""
+
+
+def digits(number: Tensor, base: int, count: int) -> Tensor:
+    """Base-``base`` digits ``[*B, count]`` of ``number`` ``[*B]``, most significant first.
+
+    Examples:
+        >>> digits(torch.tensor(7), 3, 2).tolist()
+        [2, 1]
+    """
+    if count == 1:
+        return number.unsqueeze(-1)
+    powers = base ** torch.arange(count - 1, -1, -1, device=number.device)
+    return number.unsqueeze(-1) // powers % base

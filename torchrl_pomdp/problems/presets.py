@@ -1,0 +1,51 @@
+"""The problems by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from torchrl_pomdp.checks import check_flag, check_text, shown
+from torchrl_pomdp.problems.classic import tiger
+from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.problems.repair import REPAIR_PRESETS
+from torchrl_pomdp.tensor_checks import check_device
+
+__all__ = ["PRESETS", "make_problem"]
+
+PRESETS: dict[str, Callable[..., Problem]] = {**REPAIR_PRESETS, "tiger": tiger}
+"""The known problems: functions that make them from keyword arguments, ``name`` and ``device`` among them."""
+
+
+def make_problem(name: str, *, partitioned: bool = True, device: torch.device | str = "cpu", **options: Any) -> Problem:
+    """Build a problem by name.
+
+    Args:
+        name: one of :data:`PRESETS`.
+
+    Keyword Args:
+        partitioned: whether the model has the problem's parts, or a single one, see :meth:`Problem.unpartitioned`.
+        device: where the model computes.
+        options: what else the problem's own function takes.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind, or the problem takes no such option.
+        ValueError: if there is no such problem, the message lists the known ones, or no such device.
+
+    Examples:
+        >>> make_problem("linear20").model.describe()
+        'line of 20, 1 robot: 1.9e+15 states, 3 controls, 5 observations, discount 0.99'
+        >>> make_problem("grid5x4", partitioned=False).model.partition.num_parts
+        1
+    """
+    check_text("name", name)
+    check_flag("partitioned", partitioned)
+    device = check_device("device", device)
+    if name not in PRESETS:
+        known = ", ".join(sorted(PRESETS))
+        raise ValueError(f"name must be that of a problem: unknown preset {shown(name)}; known presets: {known}")
+    problem = replace(PRESETS[name](name=name, device=device, **options), spec={"preset": name, **options})
+    return problem if partitioned else problem.unpartitioned()

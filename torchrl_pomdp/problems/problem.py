@@ -1,0 +1,178 @@
+"""What policy iteration needs to know of a problem beside its model (paper, Sections IV to VI)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_pomdp.checks import check_callable, check_instance, check_mapping, check_text
+from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
+from torchrl_pomdp.envs.generators import InPart, Mixture
+from torchrl_pomdp.envs.partition import Partition, SinglePart
+from torchrl_pomdp.envs.rows import inverse_cdf
+from torchrl_pomdp.modules.base_policies import Myopic, as_policy
+from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
+from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, ConstantCost
+from torchrl_pomdp.noise import fold, uniform
+
+__all__ = ["Problem", "Symmetry"]
+
+Symmetry = Callable[[TensorDictBase], TensorDictBase]
+"""A renaming under which the model stays what it is: maps feature states and labels ``[*B]`` to their images."""
+
+# Where the stage costs of a model without a known bound are looked at: so many start states and stages.
+_STATES, _STAGES = 256, 50
+# Stands for what is made of the model.
+_DEFAULT: Any = None
+
+
+def identity_symmetry(y: TensorDictBase) -> TensorDictBase:
+    """The symmetry that every problem has: each state is its own image."""
+    return y.copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    r"""A belief model with all that goes with it; ``Problem(model, start)`` alone can be trained.
+
+    Attributes:
+        model: the belief model. One without a partition gets :class:`~torchrl_pomdp.envs.SinglePart`, N = 1.
+        start: start states of play and evaluation.
+        name: what logs, tables and files call it.
+        training: one generator of random training states for each part of the partition. By default the start states
+            that lie in the part; states that policies visit come on top of them in any case.
+        base_policies: policies that need no training, by name; the first is the baseline of tables. Any callable that
+            writes ``"action"``. By default ``myopic``, the control of least stage cost.
+        pessimistic_cost: a positive cost of every state: the scale of value networks, and what is added where a simulation
+            is cut. By default :math:`\max|\hat g|/(1-\alpha)`, with the model's ``max_cost`` or, where it has none, the
+            largest stage cost that random play meets.
+        symmetries: renamings under which labels stay labels, the identity first. By default the identity alone.
+        encoder: what makes the encoder of the networks from the model. By default
+            :class:`~torchrl_pomdp.modules.FlatEncoder`.
+        spec: plain JSON from which the problem can be built again, see :func:`~torchrl_pomdp.problems.problem_from_spec`;
+            None for a problem of the user's own code, which is given back when a checkpoint is loaded.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if there is not one training generator for each part, or no base policy.
+
+    Examples:
+        >>> from torchrl_pomdp.envs import FixedBelief, TabularModel
+        >>> change = torch.tensor([[[0.9, 0.1], [0.0, 1.0]], [[1.0, 0.0], [1.0, 0.0]]])
+        >>> see = torch.full((2, 2, 1), 1.0)
+        >>> model = TabularModel(change, see, torch.tensor([[0.0, 5.0], [2.0, 5.0]]), 0.5)
+        >>> problem = Problem(model, FixedBelief(torch.tensor([1.0, 0.0])), name="machine")
+        >>> problem.model.partition.num_parts, list(problem.base_policies), problem.pessimistic_cost.cost
+        (1, ['myopic'], 10.0)
+    """
+
+    model: BeliefModel
+    start: StateGenerator
+    name: str = "problem"
+    training: Sequence[StateGenerator] = _DEFAULT
+    base_policies: Mapping[str, Policy] = _DEFAULT
+    pessimistic_cost: ClosedFormCost = _DEFAULT
+    symmetries: Sequence[Symmetry] = (identity_symmetry,)
+    encoder: Callable[[Any], Encoder] = FlatEncoder
+    spec: Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        check_text("name", self.name)
+        check_callable("start", self.start)
+        check_callable("encoder", self.encoder)
+        model = check_instance("model", self.model, BeliefModel)
+        if model.partition is None:
+            model = model.with_partition(SinglePart())
+        self._set(model=model)
+        self._set(
+            training=self._checked_training(),
+            base_policies=_checked_policies(self.base_policies, model),
+            symmetries=_checked_symmetries(self.symmetries),
+        )
+        if self.spec is not None:
+            check_mapping("spec", self.spec, object)
+        if self.pessimistic_cost is None:
+            bound = model.max_cost if model.max_cost is not None else _largest_cost(model, self.start)
+            self._set(pessimistic_cost=ConstantCost(model, (bound or 1.0) / (1.0 - model.discount)))
+        check_instance("pessimistic_cost", self.pessimistic_cost, ClosedFormCost)
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def _checked_training(self) -> tuple[StateGenerator, ...]:
+        parts = self.partition.num_parts
+        if self.training is None:
+            return tuple(InPart(self.model, self.start, part) for part in range(parts))
+        given = tuple(check_instance("training", self.training, (tuple, list)))
+        for part, generator in enumerate(given):
+            check_callable(f"training[{part}]", generator)
+        if len(given) != parts:
+            raise ValueError(f"training must hold {parts} generators, one for each part, got {len(given)}")
+        return given
+
+    @property
+    def partition(self) -> Partition:
+        """The partition of the model."""
+        return cast(Partition, self.model.partition)
+
+    @property
+    def baseline(self) -> str:
+        """Name of the base policy that others are compared with."""
+        return next(iter(self.base_policies))
+
+    def unpartitioned(self) -> Problem:
+        """The same problem with a single part; its training states are those of all parts, in equal shares.
+
+        Examples:
+            >>> from torchrl_pomdp.problems import make_problem
+            >>> make_problem("linear20").unpartitioned().model.partition.num_parts
+            1
+        """
+        if isinstance(self.partition, SinglePart):
+            return self
+        spec = None if self.spec is None else {**self.spec, "partitioned": False}
+        training = (Mixture(self.training, [1.0] * len(self.training)),)
+        return replace(self, model=self.model.with_partition(SinglePart()), training=training, spec=spec)
+
+
+def _checked_policies(policies: Any, model: BeliefModel) -> dict[str, TensorDictModuleBase]:
+    if policies is None:
+        return {"myopic": Myopic(model)}
+    check_mapping("base_policies", policies, object)
+    if not policies:
+        raise ValueError("base_policies is empty: give at least one policy, or None for the myopic one")
+    for name, policy in policies.items():
+        check_text("name in base_policies", name)
+        check_callable(f"base_policies[{name!r}]", policy)
+    return {name: as_policy(policy, model) for name, policy in policies.items()}
+
+
+def _checked_symmetries(symmetries: Any) -> tuple[Symmetry, ...]:
+    given = tuple(check_instance("symmetries", symmetries, (tuple, list)))
+    if not given:
+        raise ValueError("symmetries is empty: it holds at least the identity, which is the default")
+    for i, symmetry in enumerate(given):
+        check_callable(f"symmetries[{i}]", symmetry)
+    return given
+
+
+def _largest_cost(model: BeliefModel, start: StateGenerator) -> float:
+    """The largest absolute stage cost of any legal control on trajectories of random play."""
+    keys = torch.arange(_STATES, device=model.device)
+    y, largest = model.drawn(start, keys, "start"), 0.0
+    for stage in range(_STAGES):
+        mask = model.action_mask(y)
+        for control in range(model.num_controls):
+            cost = model.expected_cost(y, torch.full_like(keys, control)).abs()
+            largest = max(largest, float(cost.masked_fill(~mask[:, control] | model.is_terminal(y), 0.0).max()))
+        noise = uniform(fold(keys, stage).unsqueeze(-1), torch.arange(model.noise_dim + 1, device=keys.device))
+        u = inverse_cdf(mask.to(model.dtype), noise[:, -1].to(model.dtype))
+        _, y = model.advance(y, u, noise[:, :-1])
+    return largest

@@ -1,0 +1,155 @@
+"""Repair problems: the paper's by name, and one's own (Section VI)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_sequence, shown
+from torchrl_pomdp.envs.belief_model import StateGenerator
+from torchrl_pomdp.envs.generators import InPart
+from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.envs.repair import (
+    CalibratedStart,
+    Graph,
+    RandomState,
+    RepairModel,
+    RepairPartition,
+    UniformStart,
+    damage_chain,
+    grid,
+    line,
+    symmetries,
+)
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, UrgencyRepair
+from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.tensor_checks import check_device
+
+__all__ = ["REPAIR_PRESETS", "repair_problem"]
+
+COSTS = (0.0, 0.1, 1.0, 10.0, 100.0)
+DEGRADATION = (0.0, 0.02, 0.03, 0.05)
+DISCOUNT = 0.99
+
+
+def repair_problem(
+    graph: Graph,
+    chain: Tensor,
+    costs: Tensor | Sequence[float],
+    discount: float,
+    *,
+    num_robots: int = 1,
+    start: Callable[[RepairModel], StateGenerator] = CalibratedStart,
+    partition: Partition | None = None,
+    name: str | None = None,
+    device: torch.device | str = "cpu",
+) -> Problem:
+    r"""A repair problem with everything that training asks for: partition, training states, base policies, symmetries.
+
+    Args:
+        graph: where the robots move.
+        chain: row-stochastic matrix ``[K, K]`` of the damage levels, see :func:`~torchrl_pomdp.envs.repair.damage_chain`.
+        costs: cost of a location per stage at each level, ``[K]``.
+        discount: :math:`\alpha` in (0, 1).
+
+    Keyword Args:
+        num_robots: R.
+        start: what makes the start states from the model, such as
+            :class:`~torchrl_pomdp.envs.repair.CalibratedStart`; of a user's own: a function that is given the model and
+            returns a function from int64 keys ``[*B]`` to feature states ``[*B]``.
+        partition: the parts; None: the six of Section VI-B.
+        name: what it is called; None: as the graph.
+        device: where the model computes.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if an argument is out of range, see :class:`~torchrl_pomdp.envs.repair.RepairModel`.
+
+    Examples:
+        >>> hub = Graph.from_edges("hub", 5, [(0, 1), (0, 2), (0, 3), (3, 4)])
+        >>> problem = repair_problem(hub, damage_chain((0.0, 0.1)), (0.0, 1.0, 10.0), 0.95, num_robots=2)
+        >>> problem.model.partition.num_parts, list(problem.base_policies)
+        (6, ['greedy', 'urgency'])
+    """
+    check_callable("start", start)
+    device = check_device("device", device)
+    if partition is None:
+        partition = RepairPartition(check_instance("graph", graph, Graph), torch.as_tensor(costs), device=device)
+    model = RepairModel(graph, chain, costs, discount, num_robots=num_robots, partition=partition, device=device)
+    return Problem(
+        model,
+        start(model),
+        name=graph.name if name is None else name,
+        training=_training(model, partition),
+        base_policies={"greedy": GreedyRepair(model), "urgency": UrgencyRepair(model)},
+        pessimistic_cost=NeverRepairCost(model),
+        symmetries=symmetries(model),
+        encoder=RelativeEncoder,
+    )
+
+
+def _training(model: RepairModel, partition: Partition) -> list[StateGenerator]:
+    """Random states of every part: a phase is proposed, all else is met by rejection."""
+    everywhere, startgame, endgame = (RandomState(model, share) for share in ((0.0, 1.0), (0.5, 1.0), (0.0, 0.5)))
+    if isinstance(partition, RepairPartition):
+        return [InPart(model, startgame if part < 3 else endgame, part) for part in range(partition.num_parts)]
+    return [InPart(model, everywhere, part) for part in range(partition.num_parts)]
+
+
+def _preset(
+    graph: Graph,
+    num_robots: int = 1,
+    start: Callable[[RepairModel], StateGenerator] = CalibratedStart,
+    *,
+    name: str,
+    device: torch.device,
+) -> Problem:
+    chain, costs = damage_chain(DEGRADATION), torch.tensor(COSTS)
+    return repair_problem(graph, chain, costs, DISCOUNT, num_robots=num_robots, start=start, name=name, device=device)
+
+
+def _edges(edges: Any, *, locations: int | None = None, columns: Any = None, rows: Any = None) -> Graph:
+    """A graph by its edges, as files have it; there are as many locations as the edges name."""
+    pairs = [tuple(pair) for pair in check_sequence("edges", edges, (list, tuple))]
+    if any(len(pair) != 2 for pair in pairs):
+        raise ValueError(f"edges must hold pairs of locations, got {shown(next(pair for pair in pairs if len(pair) != 2))}")
+    ends = [check_integer("edges", end, 0) for pair in pairs for end in pair]
+    size = max(ends, default=0) + 1 if locations is None else locations
+    return Graph.from_edges("graph", size, pairs, columns=columns, rows=rows)
+
+
+def _grid(size: Any) -> Graph:
+    if not isinstance(size, (list, tuple)) or len(size) != 2:
+        raise ValueError(f"grid must be [width, height], got {shown(size)}")
+    return grid(*size)
+
+
+GRAPHS: dict[str, Callable[..., Graph]] = {"line": line, "grid": _grid, "edges": _edges}
+"""Graphs as problem files name them."""
+
+STARTS: dict[str, Callable[..., StateGenerator]] = {"calibrated": CalibratedStart, "uniform": UniformStart}
+"""Start states as problem files name them: of a model, and a fraction of the locations or the robots' locations."""
+
+
+def chain_of(chain: Any, degradation: Any) -> Tensor:
+    """The damage chain of a file: its matrix, or the probabilities that each level degrades to the next."""
+    if chain is None:
+        return damage_chain(degradation)
+    try:
+        return torch.tensor(chain, dtype=torch.float64)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise ValueError(f"chain must be rows of numbers, one for each level: {error}") from error
+
+
+REPAIR_PRESETS: dict[str, Callable[..., Problem]] = {
+    "line3": partial(_preset, line(3), start=UniformStart),
+    "linear20": partial(_preset, line(20)),
+    "grid5x4": partial(_preset, grid(5, 4)),
+    "grid6x6": partial(_preset, grid(6, 6)),
+    "two_robots20": partial(_preset, line(20), 2),
+}
+"""The paper's problems by name."""
