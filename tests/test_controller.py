@@ -200,6 +200,7 @@ def test_tiger_by_names():
     controller.update(0, 0)
     torch.testing.assert_close(controller.state["belief"][0], torch.tensor(0.85**2 / (0.85**2 + 0.15**2)))
     nameless = Controller(tiger().model, Myopic(tiger().model))
+    nameless.model.control_names = None
     nameless.reset(problem.start(torch.tensor(0)))
     assert nameless.act().names == ("0",)
     with pytest.raises(ValueError, match=r"control must be a number in 0\.\.2, got 'listen': the model has no names for it"):

@@ -61,7 +61,7 @@ def test_environments_draw_legal_controls_there():
 
 def test_generators_may_give_states_of_the_cpu():
     half = torch.full((1, 2, 2), 0.5)
-    model = TabularModel(half, half, torch.zeros(2, 1), 0.9, device="cuda")
+    model = TabularModel(half, half, torch.zeros(1, 2), 0.9, device="cuda")
     assert BeliefEnv(model, FixedBelief(torch.tensor([0.3, 0.7])), batch_size=(2,)).reset()["belief"].is_cuda
 
 
@@ -69,7 +69,7 @@ def test_tabular_models_agree_with_the_cpu():
     generator = torch.Generator().manual_seed(0)
     transition, observation = torch.rand(4, 33, 33, generator=generator), torch.rand(4, 33, 7, generator=generator)
     tables = transition / transition.sum(-1, keepdim=True), observation / observation.sum(-1, keepdim=True)
-    cost = torch.rand(33, 4, generator=generator)
+    cost = torch.rand(4, 33, generator=generator)
     belief = torch.rand(500, 33, generator=generator)
     u = torch.arange(500) % 4
     probs = []

@@ -1,4 +1,4 @@
-"""The command ``torchrl-pomdp``: train policies, evaluate them, reproduce the paper's experiments.
+"""The command ``torchrl-pomdp``: train policies, evaluate them, reproduce the paper's experiments, list the problems.
 
 Nothing that takes long to import is imported before the arguments are read.
 """
@@ -112,6 +112,11 @@ class Reproduce:
     """Device to compute on, such as cpu or cuda:0."""
 
 
+@dataclass(frozen=True)
+class Problems:
+    """List the known problems with their numbers of states, controls and observations."""
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the command with ``args`` (default: the process's); returns the exit status, 2 for input that was refused."""
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -121,8 +126,9 @@ def main(args: list[str] | None = None) -> int:
         Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
+        | Annotated[Problems, tyro.conf.subcommand("problems")]
     )
-    command: Train | Evaluate | Reproduce = tyro.cli(choices, prog="torchrl-pomdp", args=args)
+    command: Train | Evaluate | Reproduce | Problems = tyro.cli(choices, prog="torchrl-pomdp", args=args)
     from torchrl import logger
 
     from torchrl_pomdp import commands
@@ -133,8 +139,10 @@ def main(args: list[str] | None = None) -> int:
             commands.train(command)
         elif isinstance(command, Evaluate):
             commands.evaluate(command)
-        else:
+        elif isinstance(command, Reproduce):
             commands.reproduce(command)
+        else:
+            commands.problems()
     except (ValueError, TypeError, OSError) as error:
         print(f"torchrl-pomdp: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

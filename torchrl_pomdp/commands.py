@@ -17,7 +17,7 @@ from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import check_folder, write_json
 from torchrl_pomdp.modules import Policy
 from torchrl_pomdp.noise import fold, seed_keys
-from torchrl_pomdp.problems import Problem
+from torchrl_pomdp.problems import PRESETS, Problem, make_problem
 from torchrl_pomdp.problems.find import find_problem
 from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, ratio_texts, table
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from torchrl_pomdp.cli import Evaluate, Reproduce, Train
 
-__all__ = ["evaluate", "reproduce", "train"]
+__all__ = ["evaluate", "problems", "reproduce", "train"]
 
 
 def train(command: Train) -> None:
@@ -131,3 +131,13 @@ def reproduce(command: Reproduce) -> None:
         tell=lambda text: print(f"\n{text}", flush=True),
         progress=True,
     )
+
+
+def problems() -> None:
+    """Print a line for each known problem."""
+    width = max(map(len, PRESETS))
+    for name in PRESETS:
+        problem = make_problem(name)
+        parts = problem.partition.num_parts
+        bases = ", ".join(problem.base_policies)
+        print(f"{name:{width}}  {problem.model.describe()}; {parts} part{'s' * (parts > 1)}; base policies {bases}")

@@ -54,8 +54,8 @@ class PolicyIterationConfig:
     allocation: Literal["uniform", "adaptive"] = "uniform"
     """Whether every control gets all trajectories, or the clearly beaten ones no more of them."""
 
-    max_steps: int = 400
-    """Stages after which a simulated trajectory is cut."""
+    max_steps: int | None = None
+    """Stages after which a simulated trajectory is cut; None: as many as the discount asks for, 400 for 0.99."""
 
     visited_share: float = 0.7
     """Share of the training states taken from the memory of visited states, in [0, 1]; the rest are random."""
@@ -114,6 +114,8 @@ class PolicyIterationConfig:
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
     """A field's value as it is kept."""
+    if name == "max_steps" and value is None:
+        return None
     if name in _COUNTS:
         return check_integer(name, value, 1, _COUNTS[name])
     if name in _INTERVALS:

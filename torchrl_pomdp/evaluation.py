@@ -67,7 +67,7 @@ def discounted_costs(
     *,
     num_states: int = 1000,
     seed: int = 0,
-    max_steps: int = 400,
+    max_steps: int | None = None,
     terminal_cost: TerminalCost | None = None,
     progress: bool = False,
     name: str = "evaluate",
@@ -84,7 +84,7 @@ def discounted_costs(
     Keyword Args:
         num_states: number of start states.
         seed: seed of the start states and of the noise.
-        max_steps: stages after which a trajectory is cut.
+        max_steps: stages after which a trajectory is cut; None: as the discount asks for, see :attr:`BeliefModel.horizon`.
         terminal_cost: what a cut adds, see :class:`TruncatedRollout`.
         progress: whether to show a progress bar, which counts decisions.
         name: label of the progress bar.

@@ -31,7 +31,7 @@ def distributions(generator, *shape):
 
 def tabular(size, controls, observations, dtype):
     generator = torch.Generator().manual_seed(size)
-    cost = torch.randn(size, controls, generator=generator, dtype=torch.float64) * 100
+    cost = torch.randn(controls, size, generator=generator, dtype=torch.float64) * 100
     rows = distributions(generator, controls, size, size), distributions(generator, controls, size, observations)
     model = TabularModel(*rows, cost, 0.95, dtype=dtype)
     belief = distributions(generator, ROWS, size).to(dtype)

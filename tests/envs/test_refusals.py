@@ -116,7 +116,7 @@ def repair(**change):
 
 def tabular(**change):
     half = torch.full((1, 2, 2), 0.5)
-    return TabularModel(**{"transition": half, "observation": half, "cost": torch.zeros(2, 1), "discount": 0.9, **change})
+    return TabularModel(**{"transition": half, "observation": half, "cost": torch.zeros(1, 2), "discount": 0.9, **change})
 
 
 class NoNames(SinglePart):
@@ -167,7 +167,7 @@ def test_models(make, change, error):
         (tabular, {"transition": torch.zeros(1, 0, 0)}, ValueError),
         (tabular, {"transition": torch.full((1, 2, 2), NAN)}, ValueError),
         (tabular, {"observation": torch.zeros(1, 2, 0)}, ValueError),
-        (tabular, {"cost": HUGE.view(2, 1)}, ValueError),
+        (tabular, {"cost": HUGE.view(1, 2)}, ValueError),
     ],
 )
 def test_arguments_of_one_model(make, change, error):
@@ -196,7 +196,7 @@ MODEL = make_problem("line3").model
         (lambda: RandomState(MODEL, max_age=1.5), TypeError, "max_age"),
         (lambda: InPart(MODEL, 3, 0), TypeError, "proposal"),
         (lambda: InPart(MODEL, len, 0.0), TypeError, "part"),
-        (lambda: InPart(tiger().model, len, 0), ValueError, "part"),
+        (lambda: InPart(tabular(), len, 0), ValueError, "part"),
         (lambda: InPart(MODEL, len, 0, 0), ValueError, "max_tries"),
         (lambda: Mixture([], []), ValueError, "generators"),
         (lambda: Mixture([3], [1.0]), TypeError, "generators"),

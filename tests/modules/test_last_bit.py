@@ -148,7 +148,7 @@ def test_labels_of_repair_problems(dtype):
 def test_labels_of_tabular_problems(states, dtype):
     generator = torch.Generator().manual_seed(states)
     moves, sees = (torch.rand(3, states, n, generator=generator) for n in (states, 4))
-    cost = torch.rand(states, 3, generator=generator)
+    cost = torch.rand(states, 3, generator=generator).T
     model = TabularModel(moves / moves.sum(-1, keepdim=True), sees / sees.sum(-1, keepdim=True), cost, 0.9, dtype=dtype)
     belief = torch.rand(COUNT, states, generator=generator).to(dtype)
     y = TensorDict({"belief": belief / belief.sum(-1, keepdim=True)}, [COUNT])

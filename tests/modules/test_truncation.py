@@ -42,7 +42,7 @@ class Countdown(Partition):
 def ring() -> TabularModel:
     """States 0, 1, 2, 3, 0, ... one after the other, seen exactly; state i costs i + 1, the discount is a half."""
     transition = torch.eye(4).roll(1, 1).unsqueeze(0)
-    return TabularModel(transition, torch.eye(4).unsqueeze(0), torch.arange(1.0, 5.0).unsqueeze(1), 0.5, partition=MostLikely())
+    return TabularModel(transition, torch.eye(4).unsqueeze(0), torch.arange(1.0, 5.0).unsqueeze(0), 0.5, partition=MostLikely())
 
 
 def only(y):
@@ -303,8 +303,10 @@ def test_bad_rules_are_refused(linear20):
         TruncatedRollout(model, greedy, truncation=AfterSteps(3))
     with pytest.raises(ValueError, match=r"parts must be in 0\.\.5, got \(3, 6\)"):
         TruncatedRollout(model, greedy, truncation=AfterSteps(3) | OnEntering((3, 6)), terminal_cost=damage)
+    known = tiger().model
+    bare = TabularModel(known.transition, known.observation, known.cost, 0.9)
     with pytest.raises(ValueError, match=r"OnLeaving reads \['partition'\]"):
-        TruncatedRollout(tiger().model, only, truncation=OnLeaving() | AfterSteps(3), terminal_cost=hundred)
+        TruncatedRollout(bare, only, truncation=OnLeaving() | AfterSteps(3), terminal_cost=hundred)
     with pytest.raises(TypeError):
         AfterSteps(3) | 4
 

@@ -74,7 +74,7 @@ class StateMemory:
 
     @torch.no_grad()
     def visit(
-        self, policy: Policy, start: StateGenerator, keys: Tensor, *, exploration: float = 0.0, max_steps: int = 400
+        self, policy: Policy, start: StateGenerator, keys: Tensor, *, exploration: float = 0.0, max_steps: int | None = None
     ) -> None:
         """Follow a policy from start states and remember what it visits.
 
@@ -85,7 +85,7 @@ class StateMemory:
 
         Keyword Args:
             exploration: probability of a random legal control at each step, in [0, 1].
-            max_steps: length at which trajectories are cut.
+            max_steps: length at which trajectories are cut; None: :attr:`BeliefModel.horizon`.
 
         Raises:
             TypeError: if an argument is of the wrong kind.
@@ -95,7 +95,7 @@ class StateMemory:
         check_callable("policy", policy)
         check_callable("start", start)
         exploration = check_number("exploration", exploration, "[0, 1]")
-        max_steps = check_integer("max_steps", max_steps, 1, MAX_STEPS)
+        max_steps = check_integer("max_steps", self.model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
         if check_keys("keys", keys).ndim != 1:
             raise ValueError(f"keys must have shape [N], got {tuple(keys.shape)}")
         for block in keys.split(_BLOCK):

@@ -2,17 +2,19 @@
 
 from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
-from torchrl_pomdp.envs.generators import FixedBelief, InPart, Mixture
-from torchrl_pomdp.envs.partition import Partition, SinglePart
+from torchrl_pomdp.envs.generators import FixedBelief, InPart, Mixture, RandomPlay
+from torchrl_pomdp.envs.partition import FunctionPartition, Partition, SinglePart
 from torchrl_pomdp.envs.tabular import TabularModel
 
 __all__ = [
     "BeliefEnv",
     "BeliefModel",
     "FixedBelief",
+    "FunctionPartition",
     "InPart",
     "Mixture",
     "Partition",
+    "RandomPlay",
     "SinglePart",
     "StateGenerator",
     "TabularModel",

@@ -7,6 +7,7 @@ TorchRL call :class:`~torchrl_pomdp.envs.BeliefEnv`, a thin skin over it.
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -23,7 +24,10 @@ from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.noise import fingerprint
 from torchrl_pomdp.tensor_checks import check_keys
 
-__all__ = ["BeliefModel", "StateGenerator", "generated"]
+__all__ = ["INSIGNIFICANT", "BeliefModel", "StateGenerator", "generated"]
+
+# Discount of a stage from which on all costs may be left out: that of the 400th, where it is the paper's 0.99.
+INSIGNIFICANT = 0.018
 
 StateGenerator = Callable[[Tensor], TensorDictBase]
 """Distribution of feature states: maps int64 keys ``[*B]`` to feature states ``[*B]``, the same key to the same state."""
@@ -104,6 +108,17 @@ class BeliefModel(nn.Module, ABC):
         other._modules = dict(self._modules)
         other.partition = partition
         return other
+
+    @property
+    def horizon(self) -> int:
+        r"""Stages after which discounting has made the rest insignificant: the least m with :math:`\alpha^m\le 0.018`.
+
+        Examples:
+            >>> from torchrl_pomdp.problems import make_problem
+            >>> make_problem("linear20").model.horizon, make_problem("tiger").model.horizon
+            (400, 79)
+        """
+        return math.ceil(math.log(INSIGNIFICANT) / math.log(self.discount))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> BeliefModel:
         """Refuse what would move or convert tensors: tables that are no buffers would stay behind."""
@@ -345,9 +360,10 @@ class BeliefModel(nn.Module, ABC):
         return self.estimator(y, u, torch.tensor(z, device=self.device))
 
     def describe(self) -> str:
-        """One line: what the model is, with the numbers of controls and observations."""
+        """One line: what the model is, with the numbers of states, where it is known, of controls and of observations."""
+        states = f"{self.num_states} states, " if hasattr(self, "num_states") else ""
         return (
-            f"{type(self).__name__}: {self.num_controls} controls, {self.num_observations} observations, "
+            f"{type(self).__name__}: {states}{self.num_controls} controls, {self.num_observations} observations, "
             f"discount {self.discount:g}"
         )
 

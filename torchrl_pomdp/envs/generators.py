@@ -14,14 +14,16 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator, generated
-from torchrl_pomdp.envs.rows import inverse_cdf
+from torchrl_pomdp.envs.rows import inverse_cdf, put_rows, take_rows
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import check_distributions, check_keys, check_tensor
 
-__all__ = ["FixedBelief", "InPart", "Mixture", "draw_each"]
+__all__ = ["FixedBelief", "InPart", "Mixture", "RandomPlay", "draw_each"]
 
 # What a key's independent streams of uniforms are for, beside those of the generators that are drawn from.
-_RETRY, _CHOICE = 6, 7
+_RETRY, _CHOICE, _LENGTH, _PLAY = range(6, 10)
+# Probability that random play keeps a control for another stage.
+_KEPT = 0.75
 # Candidates that a rejection round makes at once.
 _BATCH = 4096
 
@@ -41,6 +43,7 @@ class InPart:
             candidate among ``max_tries``.
 
     Examples:
+        >>> from torchrl_pomdp.envs.repair import RandomState
         >>> from torchrl_pomdp.problems import make_problem
         >>> model = make_problem("linear20").model
         >>> y = InPart(model, RandomState(model), part=2)(torch.arange(50))
@@ -130,6 +133,57 @@ class Mixture:
         probs = self.weights.to(keys.device).expand(flat.numel(), -1)
         which = inverse_cdf(probs, uniform(fold(flat, _CHOICE), 0))
         return draw_each(self.generators, which, flat).view(keys.shape)
+
+
+class RandomPlay:
+    """Feature states that random play reaches from the start: what there is to train on where nothing better is known.
+
+    Each state is that after a random number of stages. A control is kept for some stages, four on average, so that play goes
+    further than by independent ones. Play ends in terminal states.
+
+    Args:
+        model: the belief model.
+        start: generator of start states.
+        max_stages: largest number of stages.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if ``max_stages`` is out of bounds; when called, if the start is no state of the model.
+
+    Examples:
+        >>> from torchrl_pomdp.problems import tiger
+        >>> problem = tiger()
+        >>> y = RandomPlay(problem.model, problem.start)(torch.arange(100))
+        >>> len(y["belief"][:, 0].unique()) > 5
+        True
+    """
+
+    def __init__(self, model: BeliefModel, start: StateGenerator, max_stages: int = 50) -> None:
+        self.model, self.start = check_instance("model", model, BeliefModel), check_callable("start", start)
+        self.max_stages = check_integer("max_stages", max_stages, 0, 10_000)
+
+    def __call__(self, keys: Tensor) -> TensorDictBase:
+        """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
+        model, flat = self.model, check_keys("keys", keys).reshape(-1)
+        y = model.drawn(self.start, flat, "start").select(*model.state_keys)
+        length = (uniform(fold(flat, _LENGTH), 0) * (self.max_stages + 1)).to(torch.int64)
+        u = torch.full_like(flat, -1)
+        for stage in range(self.max_stages):
+            live = ((length > stage) & ~model.is_terminal(y)).nonzero().squeeze(-1)
+            if not live.numel():
+                break
+            now = take_rows(y, live)
+            noise = uniform(
+                fold(fold(flat[live], _PLAY), stage).unsqueeze(-1), torch.arange(model.noise_dim + 2, device=flat.device)
+            )
+            u[live] = self._controls(model.action_mask(now), u[live], noise[:, -2], noise[:, -1])
+            y = put_rows(y, live, model.advance(now, u[live], noise[:, :-2])[1])
+        return y.view(keys.shape)
+
+    def _controls(self, mask: Tensor, last: Tensor, keep: Tensor, draw: Tensor) -> Tensor:
+        """The last controls ``[N]`` where they are legal and kept, else others of the ``mask`` ``[N, U]``."""
+        kept = (last >= 0) & (keep < _KEPT) & mask.gather(-1, last.clamp_min(0).unsqueeze(-1)).squeeze(-1)
+        return torch.where(kept, last, inverse_cdf(mask.to(draw.dtype), draw))
 
 
 class FixedBelief:

@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.tensor_checks import check_tensor
 
-__all__ = ["DenseTable", "SparseTable", "table"]
+__all__ = ["ROUNDING", "DenseTable", "SparseTable", "table"]
 
 # How far a given row may be from summing to one; within the second bound, the rounding of its type, it is left as it is, so
 # that a table which is written down and read again stays what it was.
-_TOLERANCE, _ROUNDING = 1e-5, {torch.float32: 1e-6, torch.float64: 1e-12}
+_TOLERANCE, ROUNDING = 1e-5, {torch.float32: 1e-6, torch.float64: 1e-10}
 # Dense tables of up to so many numbers for each control are gathered row by row, larger ones multiplied control by control.
 _SMALL = 2048
 # Numbers of a temporary array that are aimed at, and the fewest rows for which one is made.
@@ -257,7 +257,7 @@ def _check_rows(name: str, values: Tensor, sums: Tensor) -> None:
 
 def _off(sums: Tensor, dtype: torch.dtype) -> Tensor:
     """Which rows are to be scaled: their sum is off by more than rounding."""
-    return (sums - 1.0).abs() > _ROUNDING[dtype]
+    return (sums - 1.0).abs() > ROUNDING[dtype]
 
 
 def _products(rows: Tensor, planes: Tensor, block: slice) -> Tensor:

@@ -85,7 +85,7 @@ class RolloutPolicy(TensorDictModuleBase):
         trajectories: int = 10,
         leaves: Literal["control", "observation"] = "control",
         allocation: Literal["uniform", "adaptive"] = "uniform",
-        max_steps: int = 400,
+        max_steps: int | None = None,
         truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
         seed: int = 0,

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, shown
-from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.belief_model import INSIGNIFICANT, BeliefModel
 from torchrl_pomdp.envs.rows import put_rows, take_rows
 from torchrl_pomdp.modules.compiling import compiled
 from torchrl_pomdp.modules.scenarios import Scenarios
@@ -31,8 +31,6 @@ them as ``"state_value"`` ``[*B]`` (costs, lower is better). ``in_keys``, where 
 CHUNK_ROWS = 16_000
 # Longest simulation and most trajectories of an estimate: there are tables of the one, and numbers of 24 bits for the other.
 MAX_STEPS, MAX_TRAJECTORIES = 1_000_000, 1 << 24
-# Discount of the first stage that is cut up to which its cost and the later ones' may be left out.
-_INSIGNIFICANT = 0.02
 # States at which the first controls of a policy are checked.
 _CHECKED = 256
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
@@ -119,10 +117,10 @@ class TruncatedRollout(nn.Module):
         base_policy: :math:`\mu`.
 
     Keyword Args:
-        max_steps: the largest m.
+        max_steps: the largest m; None: as the discount asks for, see :attr:`BeliefModel.horizon`.
         truncation: rule that cuts trajectories earlier, see :mod:`~torchrl_pomdp.modules.truncation`; None: never.
         terminal_cost: :math:`\hat J`, added at the cut. None leaves the rest out, which is refused unless only
-            ``max_steps`` cuts and discounting has made the rest insignificant by then, :math:`\alpha^m\le 0.02`.
+            ``max_steps`` cuts and discounting has made the rest insignificant by then, :math:`\alpha^m\le 0.018`.
         chunk_rows: largest number of trajectories simulated at once; bounds the memory, never changes the result. Powers of
             two are slower: planes that lie so far apart compete for the same lines of the cache.
         compile: whether to fuse policy and belief step by ``torch.compile``, see :func:`~.compiling.compiled`; worth its
@@ -166,7 +164,7 @@ class TruncatedRollout(nn.Module):
         model: BeliefModel,
         base_policy: Policy,
         *,
-        max_steps: int = 400,
+        max_steps: int | None = None,
         truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
         chunk_rows: int = CHUNK_ROWS,
@@ -175,7 +173,7 @@ class TruncatedRollout(nn.Module):
         super().__init__()
         check_instance("model", model, BeliefModel)
         check_callable("base_policy", base_policy)
-        max_steps = check_integer("max_steps", max_steps, 1, MAX_STEPS)
+        max_steps = check_integer("max_steps", model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
         chunk_rows = check_integer("chunk_rows", chunk_rows, 1)
         if truncation is not None:
             check_instance("truncation", truncation, Truncation).check_model(model)
@@ -322,10 +320,10 @@ def _check_rest(model: BeliefModel, max_steps: int, truncation: Truncation | Non
     if truncation is not None:
         raise ValueError("truncation needs a terminal_cost, got None: a cut adds it; pass ZeroCost() to add nothing")
     weight = model.discount**max_steps
-    if weight > _INSIGNIFICANT:
+    if weight > INSIGNIFICANT:
         raise ValueError(
             f"max_steps={max_steps} needs a terminal_cost, got None: the first stage cut weighs {weight:.2g}, more than "
-            f"{_INSIGNIFICANT}; pass ZeroCost() to add nothing"
+            f"{INSIGNIFICANT}; pass ZeroCost() to add nothing"
         )
 
 

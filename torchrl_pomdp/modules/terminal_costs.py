@@ -131,7 +131,7 @@ class PolicyCost(TensorDictModuleBase):
         trajectories: int = 1,
         truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
-        max_steps: int = 400,
+        max_steps: int | None = None,
         seed: int = 0,
         chunk_rows: int = CHUNK_ROWS,
     ) -> None:

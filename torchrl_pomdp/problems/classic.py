@@ -10,6 +10,7 @@ from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.generators import FixedBelief
 from torchrl_pomdp.envs.tabular import TabularModel
 from torchrl_pomdp.modules.base_policies import Myopic
+from torchrl_pomdp.modules.rollout import Policy
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.tensor_checks import check_entries
 
@@ -43,10 +44,8 @@ class WhenProbable(TensorDictModuleBase):
     def __init__(self, model: TabularModel, control: int, state: int = 0, threshold: float = 0.0, otherwise: int = 0) -> None:
         super().__init__()
         most = check_instance("model", model, TabularModel).num_controls - 1
-        self.control, self.otherwise = (
-            check_integer("control", control, 0, most),
-            check_integer("otherwise", otherwise, 0, most),
-        )
+        self.control = check_integer("control", control, 0, most)
+        self.otherwise = check_integer("otherwise", otherwise, 0, most)
         self.state = check_integer("state", state, 0, model.num_states - 1)
         self.threshold = check_number("threshold", threshold, "[0, 1]")
 
@@ -88,7 +87,7 @@ def tiger(discount: float = 0.95, *, name: str = "tiger", device: torch.device |
         observation_names=("hear left", "hear right"),
         device=device,
     )
-    policies = {"listen": WhenProbable(model, control=0), "myopic": Myopic(model)}
+    policies: dict[str, Policy] = {"listen": WhenProbable(model, control=0), "myopic": Myopic(model)}
     return Problem(model, FixedBelief(torch.full((2,), 0.5, device=device)), name=name, base_policies=policies)
 
 
@@ -120,7 +119,7 @@ def crying_baby(discount: float = 0.9, *, name: str = "crying_baby", device: tor
         observation_names=("crying", "quiet"),
         device=device,
     )
-    policies = {
+    policies: dict[str, Policy] = {
         "hungry": WhenProbable(model, control=0, state=1, threshold=0.5, otherwise=1),
         "feed": WhenProbable(model, control=0),
     }

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.modules.rollout import Policy
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.problems.maintenance_model import INSPECT, REPLACE, Component, MaintenanceModel
@@ -98,7 +99,7 @@ class PeriodicInspection(TensorDictModuleBase):
         worn = sum_first(belief[self.threshold :].clone()) > 0.5
         inspected = (time > 0) & (time % self.period == 0)
         replaced = (belief[-1] > 0.5) | (worn & inspected)
-        inspects = ((time + 1) % self.period == 0) & (time + 1 < self.model.horizon)
+        inspects = ((time + 1) % self.period == 0) & (time + 1 < self.model.num_stages)
         return tensordict.set("action", self.model.join_controls(torch.where(replaced, REPLACE, inspects * INSPECT)))
 
 
@@ -155,7 +156,7 @@ class RandomWear:
         """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
         keys, model = check_keys("keys", keys), self.model
         shape = (*keys.shape, model.num_components, model.num_levels)
-        time = (_uniforms(keys, _TIME, 1).squeeze(-1) * model.horizon).to(torch.int64)
+        time = (_uniforms(keys, _TIME, 1).squeeze(-1) * model.num_stages).to(torch.int64)
         # Normalised exponentials are Dirichlet(1, …, 1).
         weight = -torch.log1p(-_uniforms(keys, _LEVELS, shape[-2] * shape[-1]).double()).view(shape).clamp_min(2.0**-30)
         weight[..., -1] = 0.0
@@ -188,8 +189,8 @@ class RemainingStages(ClosedFormCost):
     def __init__(self, model: MaintenanceModel) -> None:
         super().__init__()
         check_instance("model", model, MaintenanceModel)
-        left = torch.arange(model.horizon, -1, -1, dtype=torch.float64).clamp_min(1.0)
-        costs = model.max_cost * (1.0 - model.discount**left) / (1.0 - model.discount)
+        left = torch.arange(model.num_stages, -1, -1, dtype=torch.float64).clamp_min(1.0)
+        costs = (1.0 - model.discount**left) / (1.0 - model.discount) * model.max_cost
         self.register_buffer("table", costs.to(model.device, model.dtype), persistent=False)
 
     def costs(self, y: TensorDictBase) -> Tensor:
@@ -206,7 +207,7 @@ def maintenance(k: int = 5, *, name: str | None = None, device: torch.device | s
     """The maintenance problem of five components, k of which must work, for 50 stages at discount 0.99.
 
     Its base policies are ``failed``, replace what has failed, and ``condition``, inspect all periodically and replace what is
-    worn; the first is the better one, for k = 5 ``condition``. With k below 5 no period was found that is worth its inspections.
+    worn. The first of them is the better one, for k = 5 ``condition``; with k below 5 no period is worth its inspections.
 
     Args:
         k: how many components must work, 1 to 5.
@@ -226,7 +227,7 @@ def maintenance(k: int = 5, *, name: str | None = None, device: torch.device | s
     """
     k = check_integer("k", k, 1, len(COMPONENTS))
     model = MaintenanceModel(COMPONENTS, k, penalty=PENALTY, device=check_device("device", device))
-    policies = {"failed": ReplaceFailed(model), "condition": PeriodicInspection(model, *INSPECTIONS[k])}
+    policies: dict[str, Policy] = {"failed": ReplaceFailed(model), "condition": PeriodicInspection(model, *INSPECTIONS[k])}
     first = "condition" if k == len(COMPONENTS) else "failed"
     return Problem(
         model,

@@ -66,7 +66,7 @@ class MaintenanceModel(BeliefModel):
     r"""Belief model of n components, k of which must work.
 
     Core entries: ``"belief"`` float ``[*B, n, K]``, the marginal distribution of each component's level, and ``"time"`` int64
-    ``[*B]``, the number of stages gone, terminal at the horizon. A control is nothing, replace (1) or inspect (2) for each
+    ``[*B]``, the number of stages gone, terminal when all are. A control is nothing, replace (1) or inspect (2) for each
     component, an observation the level that each component shows, 0 standing for "works" where it is not inspected; both are
     numbered with the first component most significant. All controls are legal.
 
@@ -76,7 +76,7 @@ class MaintenanceModel(BeliefModel):
 
     Keyword Args:
         penalty: cost of a stage in which fewer work.
-        horizon: number of stages.
+        stages: number of stages.
         discount: :math:`\alpha`.
         partition: partition whose index becomes a feature.
         dtype: float32 or float64.
@@ -88,7 +88,7 @@ class MaintenanceModel(BeliefModel):
 
     Examples:
         >>> bulb = Component(3.0, 1.0, 0.0, 1.0, [[0.9, 0.1], [0.0, 1.0]])
-        >>> model = MaintenanceModel([bulb, bulb], 1, penalty=10.0, horizon=20)
+        >>> model = MaintenanceModel([bulb, bulb], 1, penalty=10.0, stages=20)
         >>> model.describe()
         'MaintenanceModel: 9 controls, 4 observations, discount 0.99'
         >>> from tensordict import TensorDict
@@ -98,6 +98,7 @@ class MaintenanceModel(BeliefModel):
     """
 
     state_keys = ("belief", "time")
+    max_cost: float
     chain: Tensor
     success: Tensor
     likelihood: Tensor
@@ -111,7 +112,7 @@ class MaintenanceModel(BeliefModel):
         needed: int,
         *,
         penalty: float,
-        horizon: int = 50,
+        stages: int = 50,
         discount: float = 0.99,
         partition: Partition | None = None,
         dtype: torch.dtype = torch.float32,
@@ -122,7 +123,7 @@ class MaintenanceModel(BeliefModel):
         self.num_components = self.noise_dim = len(check_sequence("components", components, Component, 1))
         self.needed = check_integer("needed", needed, 1, self.num_components)
         self.penalty = check_number("penalty", penalty, "[0, inf)")
-        self.horizon = check_integer("horizon", horizon, 1, 100_000)
+        self.num_stages = check_integer("stages", stages, 1, 100_000)
         chain = _chains(components)
         self.num_levels = chain.shape[-1]
         self.num_controls, self.num_observations = 3**self.num_components, self.num_levels**self.num_components
@@ -160,7 +161,7 @@ class MaintenanceModel(BeliefModel):
         belief = (*shape, self.num_components, self.num_levels)
         return Composite(
             belief=Bounded(0.0, 1.0, shape=belief, dtype=self.dtype, device=self.device),
-            time=Categorical(self.horizon + 1, shape=shape, dtype=torch.int64, device=self.device),
+            time=Categorical(self.num_stages + 1, shape=shape, dtype=torch.int64, device=self.device),
             shape=shape,
             device=self.device,
         )
@@ -175,8 +176,8 @@ class MaintenanceModel(BeliefModel):
         return torch.ones(*y.batch_size, self.num_controls, dtype=torch.bool, device=self.device)
 
     def is_terminal(self, y: TensorDictBase) -> Tensor:
-        """Bool ``[*B]``: the horizon is reached."""
-        return y.get("time") >= self.horizon
+        """Bool ``[*B]``: all stages are gone."""
+        return y.get("time") >= self.num_stages
 
     def join_controls(self, controls: Tensor) -> Tensor:
         """Controls ``[*B]`` from those of the components ``[*B, n]``."""
@@ -259,7 +260,7 @@ class MaintenanceModel(BeliefModel):
         weight = worn * self.likelihood[:, row * self.num_levels + shown].transpose(0, 1)
         belief = weight / sum_first(weight.transpose(0, 1).clone()).unsqueeze(1)
         belief = belief.permute(2, 0, 1).reshape(*y.batch_size, self.num_components, self.num_levels)
-        return self.successor(y, belief=belief, time=(y.get("time") + 1).clamp_max(self.horizon))
+        return self.successor(y, belief=belief, time=(y.get("time") + 1).clamp_max(self.num_stages))
 
 
 def _bands(rows: Tensor) -> list[tuple[slice, slice, Tensor]]:

@@ -12,22 +12,20 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_mapping, check_text
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
-from torchrl_pomdp.envs.generators import InPart, Mixture
+from torchrl_pomdp.envs.generators import InPart, Mixture, RandomPlay
 from torchrl_pomdp.envs.partition import Partition, SinglePart
-from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.modules.base_policies import Myopic, as_policy
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.rollout import Policy
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, ConstantCost
-from torchrl_pomdp.noise import fold, uniform
 
 __all__ = ["Problem", "Symmetry"]
 
 Symmetry = Callable[[TensorDictBase], TensorDictBase]
 """A renaming under which the model stays what it is: maps feature states and labels ``[*B]`` to their images."""
 
-# Where the stage costs of a model without a known bound are looked at: so many start states and stages.
-_STATES, _STAGES = 256, 50
+# So many states of random play show the stage costs of a model without a known bound.
+_STATES = 2048
 # Stands for what is made of the model.
 _DEFAULT: Any = None
 
@@ -45,8 +43,9 @@ class Problem:
         model: the belief model. One without a partition gets :class:`~torchrl_pomdp.envs.SinglePart`, N = 1.
         start: start states of play and evaluation.
         name: what logs, tables and files call it.
-        training: one generator of random training states for each part of the partition. By default the start states
-            that lie in the part; states that policies visit come on top of them in any case.
+        training: one generator of random training states for each part of the partition. By default the states
+            of the part that random play reaches, see :class:`~torchrl_pomdp.envs.RandomPlay`; states that policies visit
+            come on top of them in any case.
         base_policies: policies that need no training, by name; the first is the baseline of tables. Any callable that
             writes ``"action"``. By default ``myopic``, the control of least stage cost.
         pessimistic_cost: a positive cost of every state: the scale of value networks, and what is added where a simulation
@@ -109,7 +108,8 @@ class Problem:
     def _checked_training(self) -> tuple[StateGenerator, ...]:
         parts = self.partition.num_parts
         if self.training is None:
-            return tuple(InPart(self.model, self.start, part) for part in range(parts))
+            play = RandomPlay(self.model, self.start)
+            return tuple(InPart(self.model, play, part) for part in range(parts))
         given = tuple(check_instance("training", self.training, (tuple, list)))
         for part, generator in enumerate(given):
             check_callable(f"training[{part}]", generator)
@@ -164,15 +164,11 @@ def _checked_symmetries(symmetries: Any) -> tuple[Symmetry, ...]:
 
 
 def _largest_cost(model: BeliefModel, start: StateGenerator) -> float:
-    """The largest absolute stage cost of any legal control on trajectories of random play."""
-    keys = torch.arange(_STATES, device=model.device)
-    y, largest = model.drawn(start, keys, "start"), 0.0
-    for stage in range(_STAGES):
-        mask = model.action_mask(y)
-        for control in range(model.num_controls):
-            cost = model.expected_cost(y, torch.full_like(keys, control)).abs()
-            largest = max(largest, float(cost.masked_fill(~mask[:, control] | model.is_terminal(y), 0.0).max()))
-        noise = uniform(fold(keys, stage).unsqueeze(-1), torch.arange(model.noise_dim + 1, device=keys.device))
-        u = inverse_cdf(mask.to(model.dtype), noise[:, -1].to(model.dtype))
-        _, y = model.advance(y, u, noise[:, :-1])
+    """The largest absolute stage cost of any legal control in states of random play."""
+    y = RandomPlay(model, start)(torch.arange(_STATES, device=model.device))
+    mask, live = model.action_mask(y), ~model.is_terminal(y)
+    largest = 0.0
+    for control in range(model.num_controls):
+        cost = model.expected_cost(y, torch.full(y.batch_size, control, device=model.device)).abs()
+        largest = max(largest, float(cost.masked_fill(~(mask[:, control] & live), 0.0).max()))
     return largest

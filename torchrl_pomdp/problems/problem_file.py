@@ -41,7 +41,7 @@ def read_problem(path: str | PathLike[str], *, device: torch.device | str = "cpu
 
     Examples:
         >>> import tempfile
-        >>> text = "repair = {graph.edges = [[0, 1], [1, 2], [1, 3]], degradation = [0, 0.1], costs = [0, 1, 5], discount = 0.9}"
+        >>> text = "repair = {graph.edges = [[0, 1], [1, 2], [1,3]], degradation = [0, 0.1], costs = [0, 1, 5], discount = 0.9}"
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = Path(folder) / "pipes.toml"
         ...     _ = path.write_text(text)
@@ -56,12 +56,21 @@ def read_problem(path: str | PathLike[str], *, device: torch.device | str = "cpu
     try:
         spec = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(_syntax(path, text, str(error))) from error
     except RecursionError as error:
         raise ValueError(f"{path}: is nested too deeply") from error
     if isinstance(spec.get("pomdp"), str):
         spec["pomdp"] = _text(path.parent / spec["pomdp"])
     return _built(spec, path, text, device)
+
+
+def _syntax(path: Path, text: str, message: str) -> str:
+    """What the parser says, with the line in front."""
+    at = re.search(r" \(at (?:line (\d+), column \d+|end of document)\)$", message)
+    if at is None:
+        return f"{path}: {message}"
+    line = at[1] or max(1, len(text.splitlines()))
+    return f"{path}, line {line}: {message[: at.start()]}"
 
 
 def _text(path: Path) -> str:

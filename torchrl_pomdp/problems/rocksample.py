@@ -1,246 +1,77 @@
-r"""RockSample(n, k) (Smith and Simmons 2004): which rocks are worth the way, and which are worth a look first.
-
-A rover on n x n cells, k of which hold a rock, good with probability 1/2 each and independently. It knows where it is and where
-the rocks are. Sampling a good rock pays 10, a bad one costs 10; a rock is bad once it is sampled. Checking a rock at Euclidean
-distance d is right with probability :math:`(1+2^{-d/20})/2`. Leaving the map to the east pays 10 and ends it all. Moves and checks
-are free but for the discount, 0.95. The rocks stay independent given the history, so the belief is a probability for each.
-"""
+"""RockSample as a problem: the instances of papers, the base policy, and what networks see."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
 
-from torchrl_pomdp.checks import check_integer, check_sequence, shown
-from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.envs.partition import Partition
-from torchrl_pomdp.noise import seed_keys
-from torchrl_pomdp.tensor_checks import check_device, check_dtype
+from torchrl_pomdp.checks import check_instance, check_integer, check_number, check_seed
+from torchrl_pomdp.envs.rows import take_rows
+from torchrl_pomdp.modules.encoders import Encoder
+from torchrl_pomdp.noise import fold, seed_keys, uniform
+from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.problems.rocksample_model import (
+    EAST,
+    FIRST_CHECK,
+    HALVING_DISTANCE,
+    NORTH,
+    SAMPLE,
+    SOUTH,
+    WEST,
+    RockSample,
+    offsets,
+)
+from torchrl_pomdp.tensor_checks import check_device, check_entries, check_keys
 
-__all__ = ["RockSample", "rocksample"]
+__all__ = ["NearestRock", "RockEncoder", "RockSample", "random_rocks", "rocksample"]
 
-DISCOUNT, REWARD, HALVING_DISTANCE = 0.95, 10.0, 20.0
-# The controls before the checks; a check of rock i is FIRST_CHECK + i.
-NORTH, SOUTH, EAST, WEST, SAMPLE, FIRST_CHECK = range(6)
-NONE, GOOD, BAD = range(3)
 # The rocks (x east, y north) of the instances that papers report, by (n, k).
 LAYOUTS = {
     (7, 8): ((2, 0), (0, 1), (3, 1), (6, 3), (2, 4), (3, 4), (5, 5), (1, 6)),
     (11, 11): ((0, 3), (0, 7), (1, 8), (2, 4), (3, 3), (3, 8), (4, 3), (5, 8), (6, 1), (9, 3), (9, 9)),
 }
+# Random states: the shares of rocks that are known to be bad and of those that nothing is known of.
+KNOWN_BAD, UNKNOWN = 0.4, 0.4
 
 
-class RockSample(BeliefModel):
-    r"""Belief model of RockSample with n x n cells and k rocks.
+def rocksample(n: int, k: int, *, seed: int = 0, name: str = "rocksample", device: torch.device | str = "cpu") -> Problem:
+    """RockSample(n, k), from the usual start: the rover in the western column, in the middle, and nothing known.
 
-    Core entries: ``"belief"`` float ``[*B, k]``, the probability that each rock is good, and ``"location"`` int64 ``[*B, 1]``,
-    the rover's cell x + n y, or n² when it has left, which is terminal. The controls are north, south, east, west, sample, and
-    check rock 0 to k-1. Leaving the map but to the east and sampling where no rock is are illegal. A rover that has left can but
-    stay there, by the control east, at no cost. Costs are minus the rewards.
+    (7, 8) and (11, 11) have the rocks of the papers; otherwise they lie in distinct random cells.
 
     Args:
-        size: n, the side of the map.
-        rocks: their cells (x east, y north), distinct.
-        discount: :math:`\alpha`.
+        n: cells on a side.
+        k: rocks.
 
     Keyword Args:
-        partition: partition whose index becomes a feature.
-        dtype: float32 or float64.
+        seed: seed of the random cells.
+        name: what it is called.
         device: where the model computes.
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if there is no rock, a rock lies outside the map or two share a cell.
+        ValueError: if a number is not positive, or there are more rocks than cells.
 
     Examples:
-        >>> model = RockSample(7, LAYOUTS[7, 8])
-        >>> model.describe()
-        'RockSample(7, 8): 12545 states, 13 controls, 3 observations, discount 0.95'
-        >>> y = TensorDict({"belief": torch.full((1, 8), 0.5), "location": torch.tensor([[21]])}, [1])
-        >>> check = torch.tensor([FIRST_CHECK + 4])
-        >>> model.estimator(y, check, torch.tensor([GOOD]))["belief"].mul(1000).round().tolist()
-        [[500.0, 500.0, 500.0, 500.0, 963.0, 500.0, 500.0, 500.0]]
+        >>> problem = rocksample(15, 15, seed=3)
+        >>> problem.model.describe()
+        'RockSample(15, 15): 7372801 states, 20 controls, 3 observations, discount 0.95'
+        >>> problem.start(torch.arange(1))["location"].item() == 7 * 15
+        True
     """
-
-    state_keys = ("belief", "location")
-    num_observations = 3
-    max_cost = REWARD
-    observation_names = ("none", "good", "bad")
-    destinations: Tensor
-    concerns: Tensor
-    accuracy: Tensor
-    legal: Tensor
-    exit_cost: Tensor
-
-    def __init__(
-        self,
-        size: int,
-        rocks: Sequence[Sequence[int]],
-        discount: float = DISCOUNT,
-        *,
-        partition: Partition | None = None,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        super().__init__(discount, partition)
-        self.size = check_integer("size", size, 1, 1000)
-        self.rocks = _checked_rocks(rocks, self.size)
-        dtype, device = check_dtype("dtype", dtype), check_device("device", device)
-        self.num_rocks, self.exit = len(self.rocks), self.size**2
-        self.num_controls = FIRST_CHECK + self.num_rocks
-        names = [f"check rock {rock}" for rock in range(self.num_rocks)]
-        self.control_names = ("north", "south", "east", "west", "sample", *names)
-        for name, table in self._tables(dtype).items():
-            self.register_buffer(name, table.to(device), persistent=False)
-
-    def _tables(self, dtype: torch.dtype) -> dict[str, Tensor]:
-        """All that depends on cell and control alone, ``[(n² + 1) * U]``; a rover that has left is in the last cell."""
-        n, cells = self.size, self.exit
-        rocks = torch.tensor(self.rocks)
-        here = torch.arange(cells)
-        x, y = here % n, here // n
-        at = rocks[:, 0] + n * rocks[:, 1] == here.unsqueeze(-1)
-        legal = torch.ones(cells + 1, self.num_controls, dtype=torch.bool)
-        legal[:cells, :FIRST_CHECK] = torch.stack([y < n - 1, y > 0, y >= 0, x > 0, at.any(-1)], -1)
-        legal[cells] = torch.arange(self.num_controls) == EAST
-        goal = torch.arange(cells + 1).unsqueeze(-1).repeat(1, self.num_controls)
-        east = torch.where(x < n - 1, here + 1, cells)
-        goal[:cells, :SAMPLE] = torch.where(
-            legal[:cells, :SAMPLE], torch.stack([here + n, here - n, east, here - 1], -1), goal[:cells, :SAMPLE]
-        )
-        distance = (torch.stack([x, y], -1).unsqueeze(1) - rocks).double().square().sum(-1).sqrt()
-        accuracy = torch.ones(cells + 1, self.num_controls, dtype=torch.float64)
-        accuracy[:cells, FIRST_CHECK:] = (1.0 + 2.0 ** (-distance / HALVING_DISTANCE)) / 2.0
-        # The rock that a control concerns; 0 stands for none, too.
-        rock = torch.zeros(cells + 1, self.num_controls, dtype=torch.int64)
-        rock[:, FIRST_CHECK:] = torch.arange(self.num_rocks)
-        rock[:cells, SAMPLE] = at.int().argmax(-1)
-        leaves = (goal == cells) & (torch.arange(cells + 1) < cells).unsqueeze(-1)
-        tables = {
-            "destinations": goal,
-            "concerns": rock,
-            "accuracy": accuracy.to(dtype),
-            "exit_cost": -REWARD * leaves.to(dtype),
-        }
-        return {name: table.flatten() for name, table in tables.items()} | {"legal": legal}
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the model's tensors."""
-        return self.accuracy.device
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Type of beliefs and costs."""
-        return self.accuracy.dtype
-
-    def state_spec(self, batch_size: torch.Size | tuple[int, ...] = ()) -> Composite:
-        """``belief`` ``[*B, k]`` in [0, 1] and ``location`` ``[*B, 1]``."""
-        shape = torch.Size(batch_size)
-        return Composite(
-            belief=Bounded(0.0, 1.0, shape=(*shape, self.num_rocks), dtype=self.dtype, device=self.device),
-            location=Categorical(self.exit + 1, shape=(*shape, 1), dtype=torch.int64, device=self.device),
-            shape=shape,
-            device=self.device,
-        )
-
-    def describe(self) -> str:
-        """Size, and the numbers of states, controls and observations."""
-        states = self.exit * 2**self.num_rocks + 1
-        return (
-            f"RockSample({self.size}, {self.num_rocks}): {states if states < 1e9 else f'{states:.1e}'} states, "
-            f"{self.num_controls} controls, {self.num_observations} observations, discount {self.discount:g}"
-        )
-
-    def is_terminal(self, y: TensorDictBase) -> Tensor:
-        """Bool ``[*B]``: the rover has left."""
-        return y.get("location").squeeze(-1) == self.exit
-
-    def action_mask(self, y: TensorDictBase) -> Tensor:
-        """Legal controls, bool ``[*B, U]``; they depend on the cell alone."""
-        location = y.get("location")
-        return self.legal.index_select(0, location.flatten()).view(*location.shape[:-1], -1)
-
-    def expected_cost(self, y: TensorDictBase, u: Tensor) -> Tensor:
-        """10 (1 - 2p) for sampling a rock that is good with probability p, -10 for leaving, else 0: ``[*B]``."""
-        pair, _, good = self._concerned(y, u)
-        return self._cost(u, pair, good)
-
-    def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
-        """Probabilities of none, good and bad, ``[*B, 3]``: none unless a rock is checked."""
-        pair, _, good = self._concerned(y, u)
-        (_, seen_good), (_, seen_bad) = _joint(good, self.accuracy[pair])
-        blind = u < FIRST_CHECK
-        return torch.stack([blind.to(self.dtype), seen_good.masked_fill(blind, 0.0), seen_bad.masked_fill(blind, 0.0)], -1)
-
-    def estimator(self, y: TensorDictBase, u: Tensor, z: Tensor) -> TensorDictBase:
-        """F(y, u, z): Bayes' rule for the rock that is checked; a sampled rock is bad.
-
-        Raises:
-            ValueError: if a control is illegal or an observation impossible.
-        """
-        self.check_controls(y, u)
-        self.check_observations(y, z)
-        self._refuse_impossible(z, self.observation_probs(y, u).gather(-1, z.unsqueeze(-1)).squeeze(-1) > 0)
-        pair, rock, good = self._concerned(y, u)
-        return self._moved(y, u, pair, rock, good, _posterior(_joint(good, self.accuracy[pair]), z == GOOD))
-
-    def advance(self, y: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase]:
-        """One sampled step; a check sees good where the noise is below its probability. See :meth:`BeliefModel.advance`."""
-        pair, rock, good = self._concerned(y, u)
-        joint = _joint(good, self.accuracy[pair])
-        posterior = _posterior(joint, noise[..., 0] < joint[0][1])
-        return self._cost(u, pair, good), self._moved(y, u, pair, rock, good, posterior)
-
-    def observed(self, y: TensorDictBase, u: Tensor) -> Tensor:
-        """1 + the rock that is checked, 0 for controls that see nothing, int64 ``[*B, 1]``."""
-        return (u - FIRST_CHECK + 1).clamp_min(0).unsqueeze(-1)
-
-    def _concerned(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The pair of cell and control, the rock that it concerns (the first for none), and P(that rock is good), ``[*B]``."""
-        pair = y.get("location").squeeze(-1) * self.num_controls + u
-        rock = self.concerns[pair]
-        return pair, rock, y.get("belief").movedim(-1, 0).gather(0, rock.unsqueeze(0)).squeeze(0)
-
-    def _cost(self, u: Tensor, pair: Tensor, good: Tensor) -> Tensor:
-        return torch.where(u == SAMPLE, REWARD - 2.0 * REWARD * good, self.exit_cost[pair])
-
-    def _moved(self, y: TensorDictBase, u: Tensor, pair: Tensor, rock: Tensor, good: Tensor, checked: Tensor) -> TensorDictBase:
-        """The successor, if a check leaves the rock good with the probability ``checked``; beliefs are planes ``[k, *B]``."""
-        new = torch.where(u >= FIRST_CHECK, checked, good.masked_fill(u == SAMPLE, 0.0))
-        belief = y.get("belief").movedim(-1, 0).scatter(0, rock.unsqueeze(0), new.unsqueeze(0)).movedim(0, -1)
-        return self.successor(y, belief=belief, location=self.destinations[pair].unsqueeze(-1))
-
-
-_Joint = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]
-
-
-def _joint(good: Tensor, accuracy: Tensor) -> _Joint:
-    """P(rock is good, seen so) and P(seen so) for seen good and for seen bad."""
-    bad, error = 1.0 - good, 1.0 - accuracy
-    hit, missed = good * accuracy, good * error
-    return (hit, hit + bad * error), (missed, missed + bad * accuracy)
-
-
-def _posterior(joint: _Joint, seen_good: Tensor) -> Tensor:
-    """P(good) after a check."""
-    (hit, by_hit), (missed, by_missed) = joint
-    return torch.where(seen_good, hit, missed) / torch.where(seen_good, by_hit, by_missed)
-
-
-def _checked_rocks(rocks: Sequence[Sequence[int]], size: int) -> tuple[tuple[int, int], ...]:
-    check_sequence("rocks", rocks, Sequence, 1)
-    cells = []
-    for i, cell in enumerate(rocks):
-        x, y = check_sequence(f"rocks[{i}]", cell, int, 2)[:2]
-        cells.append((check_integer(f"rocks[{i}][0]", x, 0, size - 1), check_integer(f"rocks[{i}][1]", y, 0, size - 1)))
-    if len(set(cells)) < len(cells):
-        raise ValueError(f"rocks must lie in distinct cells, got {shown(rocks)}")
-    return tuple(cells)
+    n, seed = check_integer("n", n, 1, 1000), check_seed("seed", seed)
+    k = check_integer("k", k, 1, n * n)
+    model = RockSample(n, LAYOUTS.get((n, k)) or random_rocks(n, k, seed), device=check_device("device", device))
+    return Problem(
+        model,
+        Unexplored(model),
+        name=name,
+        training=(RandomRocks(model),),
+        base_policies={"nearest": NearestRock(model)},
+        encoder=RockEncoder,
+    )
 
 
 def random_rocks(size: int, count: int, seed: int) -> list[tuple[int, int]]:
@@ -252,3 +83,136 @@ def random_rocks(size: int, count: int, seed: int) -> list[tuple[int, int]]:
     """
     order = seed_keys(seed, torch.arange(size * size)).argsort()[:count].tolist()
     return [(cell % size, cell // size) for cell in order]
+
+
+class Unexplored:
+    """The usual start: the rover in the middle of the western column; every rock may be good as well as bad."""
+
+    def __init__(self, model: RockSample) -> None:
+        self.model = model
+
+    def __call__(self, keys: Tensor) -> TensorDictBase:
+        """Feature states ``[*B]`` for int64 keys ``[*B]``."""
+        shape, model = check_keys("keys", keys).shape, self.model
+        belief = torch.full((model.num_rocks, *shape), 0.5, dtype=model.dtype, device=keys.device).movedim(0, -1)
+        location = torch.full((*shape, 1), model.size * (model.size // 2), device=keys.device)
+        return TensorDict({"belief": belief, "location": location}, batch_size=shape)
+
+
+class RandomRocks:
+    """Random states: a rover anywhere; rocks are known to be bad, or nothing is known of them, or they have any probability."""
+
+    def __init__(self, model: RockSample) -> None:
+        self.model = model
+
+    def __call__(self, keys: Tensor) -> TensorDictBase:
+        """Feature states ``[*B]`` for int64 keys ``[*B]``."""
+        model, streams = self.model, fold(check_keys("keys", keys), 0)
+        rocks = torch.arange(model.num_rocks, device=keys.device).view(-1, *[1] * keys.ndim)
+        kind, good = uniform(streams, 2 * rocks + 1), uniform(streams, 2 * rocks + 2).to(model.dtype)
+        belief = torch.where(kind < KNOWN_BAD + UNKNOWN, 0.5, good).masked_fill(kind < KNOWN_BAD, 0.0).movedim(0, -1)
+        location = (uniform(streams, 0).double() * model.exit).to(torch.int64).unsqueeze(-1)
+        return TensorDict({"belief": belief, "location": location}, batch_size=keys.shape)
+
+
+class NearestRock(TensorDictModuleBase):
+    r"""Go to the nearest rock that is worth the way and sample it; check it first, from nearby, while that is not sure.
+
+    A rock is worth the way if it is good with at least the probability ``worth``, and sampled without a check with ``sure``.
+    One that is not sure is checked from at most ``look`` cells away, each check a stage. The way leads along the longer side of
+    what is left of it. Ties go to the rock with the lower index. Where no rock is worth the way the rover leaves to the east.
+
+    Args:
+        model: the model.
+        worth: probability in [0, 1].
+        sure: probability in [0, 1].
+        look: number of moves, not negative.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if an argument is out of range.
+
+    Examples:
+        >>> problem = rocksample(7, 8)
+        >>> u = NearestRock(problem.model)(problem.start(torch.arange(1)))["action"]
+        >>> problem.model.control_names[u]
+        'check rock 1'
+    """
+
+    in_keys = ["belief", "location"]
+    out_keys = ["action"]
+    moves: Tensor
+    controls: Tensor
+
+    def __init__(self, model: RockSample, worth: float = 0.5, sure: float = 0.8, look: float = 6.0) -> None:
+        super().__init__()
+        self.model = check_instance("model", model, RockSample)
+        self.worth, self.sure = check_number("worth", worth, "[0, 1]"), check_number("sure", sure, "[0, 1]")
+        self.look = check_number("look", look, "[0, inf)")
+        across, up = offsets(model.size, model.rocks)
+        moves = across.abs() + up.abs()
+        step = torch.where(across.abs() >= up.abs(), torch.where(across > 0, EAST, WEST), torch.where(up > 0, NORTH, SOUTH))
+        step[moves == 0] = SAMPLE
+        self.register_buffer("moves", moves.to(model.dtype), persistent=False)
+        self.register_buffer("controls", step.to(model.device), persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"action"``, int64 ``[*B]``."""
+        check_entries("tensordict", tensordict, self.in_keys)
+        belief = tensordict.get("belief").reshape(-1, self.model.num_rocks).T
+        location = tensordict.get("location").reshape(-1)
+        left = location == self.model.exit
+        cell = location.masked_fill(left, 0)
+        moves, rock = self.moves.index_select(1, cell).masked_fill(belief < self.worth, torch.inf).min(0)
+        unsure = belief.gather(0, rock.unsqueeze(0)).squeeze(0) < self.sure
+        step = self.controls.flatten()[rock * self.model.exit + cell]
+        action = torch.where(unsure & (moves <= self.look), FIRST_CHECK + rock, step)
+        return tensordict.set("action", action.masked_fill(left | moves.isinf(), EAST).view(tensordict.batch_size))
+
+
+class RockEncoder(Encoder):
+    r"""Every rock as the rover sees it, the rover's column and row, and what the base policy would do, both one-hot.
+
+    A rock has nine features. Two are about what is known: p, the probability that it is good, and 4p(1-p), what a check can
+    still tell. The next two are these times :math:`\alpha^d` for the d moves to it. The others depend on the place alone:
+    :math:`\alpha^d`; :math:`2^{-e/20}` for the Euclidean distance e; the offset in cells to the east and to the north, over n;
+    and whether the rover is there. All are zero for a rover that has left.
+
+    The control of :class:`NearestRock` lets a network learn where to do something else, instead of all that it does. Without
+    it a network that is wrong about a single state may check a rock that it knows for ever.
+
+    Args:
+        model: the model.
+
+    Examples:
+        >>> problem = rocksample(7, 8)
+        >>> RockEncoder(problem.model)(problem.start(torch.arange(4))).shape
+        torch.Size([4, 99])
+    """
+
+    keys = ("belief", "location")
+    places: Tensor
+
+    def __init__(self, model: RockSample) -> None:
+        super().__init__()
+        self.base_policy = NearestRock(model)
+        self.num_rocks, self.num_controls, self.exit, self.dtype = model.num_rocks, model.num_controls, model.exit, model.dtype
+        self.num_features = 9 * self.num_rocks + 2 * model.size + self.num_controls
+        across, up = (offset.double() for offset in offsets(model.size, model.rocks))
+        moves = across.abs() + up.abs()
+        told = 2.0 ** (-(across.square() + up.square()).sqrt() / HALVING_DISTANCE)
+        size, cells = torch.arange(model.size).unsqueeze(-1), torch.arange(model.exit)
+        rocks = torch.cat([model.discount**moves, told, across / model.size, up / model.size, (moves == 0).double()])
+        table = torch.cat([rocks, size == cells % model.size, size == cells // model.size])
+        # [5k + 2n, n² + 1]: all that depends on the cell alone.
+        self.register_buffer("places", nn.functional.pad(table, (0, 1)).to(model.device, model.dtype), persistent=False)
+
+    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
+        """See :class:`Encoder`."""
+        y = y.select(*self.keys) if rows is None else take_rows(y.select(*self.keys), rows)
+        location = y.get("location").squeeze(-1)
+        good = y.get("belief").T * (location < self.exit)
+        known, places = torch.cat([good, 4.0 * good * (1.0 - good)]), self.places.index_select(1, location)
+        near = known * places[: self.num_rocks].repeat(2, 1)
+        control = self.base_policy(y).get("action") == torch.arange(self.num_controls, device=y.device).unsqueeze(-1)
+        return torch.cat([known, near, places, control.to(self.dtype)]).T.contiguous()

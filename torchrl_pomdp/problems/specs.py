@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from torchrl_pomdp.checks import check_flag, check_mapping, check_text, shown
 from torchrl_pomdp.envs.generators import FixedBelief
 from torchrl_pomdp.envs.partition import SinglePart
+from torchrl_pomdp.envs.pomdp_file import parse_pomdp
 from torchrl_pomdp.envs.tabular import TabularModel
 from torchrl_pomdp.problems.presets import PRESETS, make_problem
 from torchrl_pomdp.problems.problem import Problem
@@ -30,14 +32,6 @@ _RENAMED = {
     "observation_names": "observations",
     "state_names": "states",
     "belief": "start",
-    "damaged_fraction": "start",
-    "observe_start": "start",
-    "num_locations": "graph",
-    "width": "graph",
-    "height": "graph",
-    "edges": "graph",
-    "columns": "graph",
-    "rows": "graph",
 }
 
 
@@ -96,10 +90,17 @@ def _checked(path: tuple[str, ...], default: str, build: Callable[[], Any]) -> A
     except SpecError:
         raise
     except (ValueError, TypeError) as error:
-        message = str(error)
-        first = message.split(" ")[0].split("[")[0].split(".")[0]
-        key = _RENAMED.get(first, first if first in (*_REPAIR, *_TABULAR) else default)
-        raise SpecError((*path, key), message) from error
+        raise SpecError((*path, *filter(None, [_named(str(error), path, default)])), str(error)) from error
+
+
+def _named(message: str, path: tuple[str, ...], default: str) -> str:
+    """The entry that a message speaks of, the first word that names one."""
+    entries = {("repair",): _REPAIR, ("tabular",): _TABULAR}.get(path, ())
+    for word in re.findall(r"\w+", message):
+        name = _RENAMED.get(word, word)
+        if name in entries:
+            return name
+    return default
 
 
 def _table(path: str, value: Any, allowed: tuple[str, ...], needed: tuple[str, ...]) -> dict[str, Any]:
@@ -123,6 +124,13 @@ def _one_of(path: tuple[str, ...], value: Any, known: Mapping[str, Callable[...,
     return kinds[0], {key: entry for key, entry in value.items() if key != kinds[0]}
 
 
+def _numbers(path: str, table: Mapping[str, Any], name: str, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    try:
+        return torch.tensor(table[name], dtype=dtype)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise SpecError((path, name), f"must be an array of numbers, got {shown(table[name])}") from error
+
+
 def _preset(value: Any, options: Mapping[str, Any], device: torch.device) -> Problem:
     if not isinstance(value, str) or value not in PRESETS:
         raise SpecError(("preset",), f"must be one of {', '.join(sorted(PRESETS))}, got {shown(value)}")
@@ -139,7 +147,7 @@ def _repair(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
     if ("chain" in table) == ("degradation" in table):
         raise SpecError(("repair",), "must have either chain or degradation")
     kind, options = _one_of(("repair", "graph"), table["graph"], GRAPHS)
-    graph = _checked(("repair",), "graph", lambda: GRAPHS[kind](table["graph"][kind], **options))
+    graph = _checked(("repair", "graph"), "", lambda: GRAPHS[kind](table["graph"][kind], **options))
     starts = table.get("start", {"calibrated": 0.7})
     started, more = _one_of(("repair", "start"), starts, STARTS)
     partition = table.get("partition", "six")
@@ -151,10 +159,10 @@ def _repair(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
         lambda: repair_problem(
             graph,
             chain_of(table.get("chain"), table.get("degradation")),
-            table["costs"],
+            _numbers("repair", table, "costs"),
             table["discount"],
             num_robots=table.get("robots", 1),
-            start=lambda model: STARTS[started](model, starts[started], **more),
+            start=lambda model: _checked(("repair", "start"), "", lambda: STARTS[started](model, starts[started], **more)),
             partition=SinglePart() if partition == "single" else None,
             device=device,
         ),
@@ -164,11 +172,8 @@ def _repair(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
 def _tabular(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
     table = _table("tabular", value, _TABULAR, ("discount", "transition", "observation", "cost", "start"))
 
-    def tensor(name: str, dtype: torch.dtype = torch.float64) -> torch.Tensor | None:
-        try:
-            return torch.tensor(table[name], dtype=dtype) if name in table else None
-        except (ValueError, TypeError, RuntimeError) as error:
-            raise SpecError(("tabular", name), f"must be an array of numbers: {error}") from error
+    def tensor(name: str, dtype: torch.dtype = torch.float64) -> Any:
+        return _numbers("tabular", table, name, dtype) if name in table else None
 
     def build() -> Problem:
         names = {"control_names": "controls", "observation_names": "observations", "state_names": "states"}
@@ -182,7 +187,10 @@ def _tabular(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
             device=device,
             **{argument: tuple(table[key]) for argument, key in names.items() if key in table},
         )
-        return _tabular_problem(model, tensor("start"), "tabular")
+        start = tensor("start")
+        if start.shape != (model.num_states,):
+            raise ValueError(f"start must be a distribution over {model.num_states} states, got {shown(table['start'])}")
+        return Problem(model, FixedBelief(start.to(device, model.dtype)), name="tabular")
 
     return _checked(("tabular",), "transition", build)
 
@@ -190,16 +198,8 @@ def _tabular(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
 def _pomdp(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
     if not isinstance(value, str):
         raise SpecError(("pomdp",), f"must be the text of a file .POMDP, got {shown(value)}")
-    from torchrl_pomdp.envs.pomdp_file import parse_pomdp
-
-    content = _checked((), "pomdp", lambda: parse_pomdp(value, device=device))
-    return _tabular_problem(content.model, content.start, "pomdp")
-
-
-def _tabular_problem(model: TabularModel, start: Any, name: str) -> Problem:
-    if start.shape != (model.num_states,):
-        raise ValueError(f"start must be a distribution over {model.num_states} states, got {start.numel()} numbers")
-    return Problem(model, FixedBelief(start.to(model.dtype)), name=name)
+    model, start = _checked((), "pomdp", lambda: parse_pomdp(value, device=device))
+    return Problem(model, start, name="pomdp")
 
 
 _BUILDERS = {"preset": _preset, "repair": _repair, "tabular": _tabular, "pomdp": _pomdp}

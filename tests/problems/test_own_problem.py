@@ -1,0 +1,216 @@
+"""A problem of the user's own code: trained, killed, resumed, saved, and loaded in another process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchrl_pomdp.envs import FixedBelief, Partition, TabularModel
+from torchrl_pomdp.evaluation import compare, discounted_costs
+from torchrl_pomdp.files import DamagedFileError
+from torchrl_pomdp.modules import PolicyNetwork
+from torchrl_pomdp.problems import Problem, make_problem
+from torchrl_pomdp.trainers import (
+    Checkpoint,
+    PolicyIterationConfig,
+    api,
+    load_checkpoint,
+    papi_nt,
+    papi_t,
+    policy_iteration,
+    r_t,
+    save_checkpoint,
+)
+from torchrl_pomdp.trainers.run import TrainingRun
+
+# A machine with ten levels of wear that is run, looked at, serviced or replaced.
+OWN = '''
+import torch
+from torchrl_pomdp.envs import FixedBelief, Partition, TabularModel
+from torchrl_pomdp.problems import Problem
+
+LEVELS = 10
+
+
+class Worn(Partition):
+    names = ("worn", "fresh")
+    stages = ((1,), (0,))
+
+    def forward(self, y):
+        return (y["belief"][..., :5].sum(-1) > 0.5).long()
+
+
+def model(partition=None):
+    wear = 0.7 * torch.eye(LEVELS) + 0.3 * torch.eye(LEVELS).roll(1, 1)
+    wear[-1] = torch.eye(LEVELS)[-1]
+    serviced = torch.eye(LEVELS)[(torch.arange(LEVELS) - 3).clamp_min(0)]
+    new = torch.eye(LEVELS)[torch.zeros(LEVELS, dtype=torch.int64)]
+    transition = torch.stack([wear, wear, serviced, new])
+    blind = torch.tensor([1.0, 0.0, 0.0]).expand(LEVELS, 3)
+    look = torch.stack([torch.tensor([0.9 - 0.08 * i, 0.1, 0.08 * i]) for i in range(LEVELS)])
+    level = torch.arange(LEVELS) ** 2 / 8.0
+    cost = torch.stack([level, level + 0.2, level + 3.0, level + 12.0])
+    return TabularModel(transition, torch.stack([blind, look, blind, blind]), cost, 0.9, partition=partition)
+
+
+def start(keys):
+    return FixedBelief(torch.eye(LEVELS)[0])(keys)
+
+
+def threshold(y):
+    """Replace where the mean level is 6."""
+    mean = (y["belief"] * torch.arange(LEVELS)).sum(-1)
+    return y.set("action", torch.where(mean > 6.0, 3, 0))
+
+
+def problem():
+    return Problem(model(Worn()), start, name="machine", base_policies={"threshold": threshold})
+
+
+def single():
+    return Problem(model(), start, name="machine", base_policies={"threshold": threshold})
+'''
+own = {"__name__": "own_machine"}
+exec(compile(OWN, "own_machine.py", "exec"), own)
+CONFIG = PolicyIterationConfig(
+    iterations=2, samples_per_part=1000, value_samples=100, least_steps=500, epochs=1, hidden=(32,), value_hidden=(16,),
+    batch_size=64, validation_states=300,
+)  # fmt: skip
+SMALL = replace(CONFIG, samples_per_part=60, value_samples=30, least_steps=10, validation_states=40)
+
+
+def weights(iteration):
+    return torch.cat([p.detach().flatten() for p in (*iteration.policy.parameters(), *iteration.value.parameters())])
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """Its iterations, one of which at least improves on the base policy."""
+    return list(papi_t(own["problem"](), CONFIG, own["threshold"]))
+
+
+def test_policy_iteration_improves_a_plain_function(trained):
+    problem = own["problem"]()
+    best = [iteration for iteration in trained if iteration.accepted][-1]
+    costs = [discounted_costs(problem.model, p, problem.start, num_states=2000) for p in (best.policy, own["threshold"])]
+    assert compare(*costs).ratio.interval[1] < 0.95
+
+
+def test_a_single_part_and_no_more_than_model_and_start():
+    iterations = list(api(own["single"](), CONFIG, own["threshold"]))
+    assert any(iteration.accepted for iteration in iterations)
+    bare = Problem(own["model"](), own["start"])
+    assert list(bare.base_policies) == ["myopic"]
+    (iteration, *_) = papi_nt(bare, CONFIG, bare.base_policies["myopic"])
+    assert isinstance(iteration.policy.policies[0], PolicyNetwork)
+
+
+def test_truncated_rollout_with_its_values_is_online_play(trained):
+    problem = own["problem"]()
+    policy = r_t(problem, own["threshold"], trained[0].value, trajectories=2)
+    costs = [discounted_costs(problem.model, p, problem.start, num_states=100) for p in (policy, own["threshold"])]
+    assert costs[0].mean() < costs[1].mean()
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing catches it."""
+
+
+@pytest.fixture(scope="module")
+def uninterrupted():
+    return list(papi_t(own["problem"](), SMALL, own["threshold"]))
+
+
+@pytest.mark.parametrize("after", [0, 1, 4])
+def test_killed_and_resumed_equals_uninterrupted(uninterrupted, tmp_path, monkeypatch, after):
+    calls, train_part = [], policy_iteration.train_part
+
+    def killed(*args, **options):
+        if len(calls) == after:
+            raise Killed
+        calls.append(options["name"])
+        return train_part(*args, **options)
+
+    monkeypatch.setattr(policy_iteration, "train_part", killed)
+    with pytest.raises(Killed):
+        list(papi_t(own["problem"](), SMALL, own["threshold"], folder=tmp_path))
+    monkeypatch.undo()
+    resumed = list(papi_t(own["problem"](), SMALL, own["threshold"], folder=tmp_path))
+    assert [torch.equal(weights(a), weights(b)) for a, b in zip(resumed, uninterrupted, strict=True)] == [True, True]
+
+
+def test_a_checkpoint_needs_the_problem_back(trained, tmp_path):
+    problem, path = own["problem"](), tmp_path / "own.pt"
+    save_checkpoint(path, Checkpoint(problem, CONFIG, "pAPI-T", 1, trained[0].policy, trained[0].value))
+    loaded = load_checkpoint(path, problem=own["problem"]())
+    assert torch.equal(weights(loaded), weights(trained[0]))
+    with pytest.raises(ValueError, match=r"own\.pt: the policy was trained on machine, .*: build it and give it as problem="):
+        load_checkpoint(path)
+    with pytest.raises(ValueError, match=r"own\.pt: problem must be machine, as it was when .*, got another one"):
+        load_checkpoint(path, problem=make_problem("tiger"))
+    cheaper = TabularModel(
+        own["model"]().transition, own["model"]().observation, own["model"]().cost - 1, 0.9, partition=own["Worn"]()
+    )
+    with pytest.raises(ValueError, match="got another one"):
+        load_checkpoint(path, problem=Problem(cheaper, own["start"], base_policies=problem.base_policies))
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(DamagedFileError):
+        load_checkpoint(path, problem=own["problem"]())
+
+
+def test_the_command_trains_and_evaluates_it_in_fresh_processes(tmp_path):
+    (tmp_path / "own_machine.py").write_text(OWN)
+
+    def command(*words):
+        done = subprocess.run(
+            [sys.executable, "-m", "torchrl_pomdp.cli", *words], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout + done.stderr
+
+    numbers = [
+        "--iterations",
+        "1",
+        "--samples-per-part",
+        "200",
+        "--least-steps",
+        "150",
+        "--states",
+        "60",
+        "--validation-states",
+        "60",
+        "--hidden",
+        "16",
+    ]
+    told = command("train", "own_machine:problem", "--out", "run", *numbers)
+    assert "threshold: 1.000 of threshold" in told
+    assert "machine: TabularModel: 10 states, 4 controls, 3 observations, discount 0.9; 60 start states" in command(
+        "evaluate", "run/best.pt", "--problem", "own_machine:problem", "--states", "60"
+    )
+
+
+def test_a_run_of_it_has_a_folder_of_its_own(tmp_path):
+    config = PolicyIterationConfig(1, samples_per_part=40, least_steps=1, validation_states=50)
+    run = TrainingRun(own["problem"](), config=config, states=20, online_states=0)
+    assert list(run.carry_out(tmp_path / "run")) == ["threshold", "R-NT of threshold", "pAPI-NT 1"]
+    best = load_checkpoint(tmp_path / "run" / "best.pt", problem=own["problem"]())
+    assert best.problem.name == "machine"
+    with pytest.raises(ValueError, match="differs in .*problem"):
+        TrainingRun(make_problem("tiger"), "API", config=config, states=20, online_states=0).carry_out(tmp_path / "run")
+
+
+def test_what_a_problem_must_be():
+    model, start = own["model"](), FixedBelief(torch.eye(10)[0])
+    assert issubclass(own["Worn"], Partition)
+    for wrong, message in [
+        ({"training": ()}, "training must hold 1 generators, one for each part, got 0"),
+        ({"base_policies": {}}, "base_policies is empty"),
+        ({"symmetries": ()}, "symmetries is empty"),
+        ({"pessimistic_cost": 3.0}, "pessimistic_cost must be a ClosedFormCost"),
+    ]:
+        with pytest.raises((TypeError, ValueError), match=message):
+            Problem(model, start, **wrong)
