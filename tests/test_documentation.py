@@ -17,6 +17,7 @@ SMALL = {
     "01_policy_iteration": {
         "ITERATIONS": 1, "SAMPLES_PER_PART": 40, "TRAJECTORIES": 2, "OPTIMIZATION_STEPS": 5, "EVALUATION_STATES": 20,
     },
+    "02_ppo": {"UPDATES": 1, "EVALUATION_STATES": 20},
 }  # fmt: skip
 
 
@@ -27,8 +28,9 @@ def blocks(language):
 def test_readme_blocks_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert blocks("python")
+    shared = {"__name__": "readme"}  # later blocks may use what earlier ones made
     for block in blocks("python"):
-        exec(compile(block, "README.md", "exec"), {"__name__": "readme"})
+        exec(compile(block, "README.md", "exec"), shared)
     assert capsys.readouterr().out
 
 

@@ -4,6 +4,7 @@ from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.generators import FixedBelief, InPart, Mixture, RandomPlay
 from torchrl_pomdp.envs.partition import FunctionPartition, Partition, SinglePart
+from torchrl_pomdp.envs.pomdp_file import parse_pomdp, read_pomdp, write_pomdp
 from torchrl_pomdp.envs.tabular import TabularModel
 
 __all__ = [
@@ -18,4 +19,7 @@ __all__ = [
     "SinglePart",
     "StateGenerator",
     "TabularModel",
+    "parse_pomdp",
+    "read_pomdp",
+    "write_pomdp",
 ]

@@ -214,11 +214,12 @@ class TabularModel(BeliefModel):
 
     def expected_cost(self, y: TensorDictBase, u: Tensor) -> Tensor:
         r""":math:`\sum_i b(i)\,g(i,u)`, ``[*B]``."""
-        return sum_first(self.cost[u].mul_(y.get("belief")).movedim(-1, 0))
+        # No product in place: of a single control the row is a view of the table.
+        return sum_first((self.cost[u] * y.get("belief")).movedim(-1, 0))
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
         r""":math:`\hat p(z\mid b,u)`, ``[*B, Z]``."""
-        return self._sees.mix(self._predicted(y, u), u.reshape(-1)).view(*y.batch_size, -1)
+        return self._sees.mix(self._predicted(y, u), u.reshape(-1)).view(*y.batch_size, self.num_observations)
 
     def estimator(self, y: TensorDictBase, u: Tensor, z: Tensor) -> TensorDictBase:
         """F(y, u, z) by Bayes' rule.

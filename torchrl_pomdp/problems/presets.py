@@ -4,19 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
 
 from torchrl_pomdp.checks import check_flag, check_text, shown
-from torchrl_pomdp.problems.classic import tiger
+from torchrl_pomdp.problems.classic import crying_baby, tiger
+from torchrl_pomdp.problems.maintenance import maintenance
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.problems.repair import REPAIR_PRESETS
+from torchrl_pomdp.problems.rocksample import rocksample
 from torchrl_pomdp.tensor_checks import check_device
 
 __all__ = ["PRESETS", "make_problem"]
 
-PRESETS: dict[str, Callable[..., Problem]] = {**REPAIR_PRESETS, "tiger": tiger}
+PRESETS: dict[str, Callable[..., Problem]] = {
+    **REPAIR_PRESETS,
+    "tiger": tiger,
+    "crying_baby": crying_baby,
+    **{f"rocksample{n}x{k}": partial(rocksample, n=n, k=k) for n, k in ((7, 8), (11, 11), (15, 15))},
+    **{f"maintenance{k}": partial(maintenance, k=k) for k in range(1, 6)},
+}
 """The known problems: functions that make them from keyword arguments, ``name`` and ``device`` among them."""
 
 

@@ -114,7 +114,7 @@ def _preset(
 
 def _edges(edges: Any, *, locations: int | None = None, columns: Any = None, rows: Any = None) -> Graph:
     """A graph by its edges, as files have it; there are as many locations as the edges name."""
-    pairs = [tuple(pair) for pair in check_sequence("edges", edges, (list, tuple))]
+    pairs = [tuple(pair) for pair in check_sequence("edges", edges, Sequence)]
     if any(len(pair) != 2 for pair in pairs):
         raise ValueError(f"edges must hold pairs of locations, got {shown(next(pair for pair in pairs if len(pair) != 2))}")
     ends = [check_integer("edges", end, 0) for pair in pairs for end in pair]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -95,7 +95,7 @@ def _checked(path: tuple[str, ...], default: str, build: Callable[[], Any]) -> A
 
 def _named(message: str, path: tuple[str, ...], default: str) -> str:
     """The entry that a message speaks of, the first word that names one."""
-    entries = {("repair",): _REPAIR, ("tabular",): _TABULAR}.get(path, ())
+    entries = {"repair": _REPAIR, "tabular": _TABULAR}.get(".".join(path), ())
     for word in re.findall(r"\w+", message):
         name = _RENAMED.get(word, word)
         if name in entries:
@@ -185,7 +185,7 @@ def _tabular(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
             legal=tensor("legal", torch.bool),
             terminal=tensor("terminal", torch.bool),
             device=device,
-            **{argument: tuple(table[key]) for argument, key in names.items() if key in table},
+            **cast(Any, {argument: tuple(table[key]) for argument, key in names.items() if key in table}),
         )
         start = tensor("start")
         if start.shape != (model.num_states,):
