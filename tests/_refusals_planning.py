@@ -103,6 +103,7 @@ ENVS = {
         slot_names=(("left", "right"), sequences(("left", "right"), 1, None, "", "\x1b[31m", free=False)),
         columns=([0, 1, 2], [*COORDINATES, *values((0, 0, 1))]),
         rows=([0, 0, 0], COORDINATES),
+        location_names=(("a", "b", "c"), sequences(("a", "b", "c"), "a", "", 3, None, free=False, empty=False)),
     ),
     "envs.repair.Graph.from_edges": lambda _: case(
         Graph.from_edges,
@@ -111,6 +112,7 @@ ENVS = {
         edges=([(0, 1), (1, 2)], sequences([(0, 1), (1, 2)], *WRONG_EDGES)),
         columns=([0, 1, 2], [*COORDINATES, *values((0, 0, 1))]),
         rows=([0, 0, 0], COORDINATES),
+        location_names=(("a", "b", "c"), sequences(("a", "b", "c"), "a", "", 3, None, free=False, empty=False)),
     ),
     "envs.repair.damage_chain": lambda _: case(
         repair.damage_chain,
@@ -140,8 +142,8 @@ ENVS = {
         observation=(HEAR, probabilities(HEAR, free=True)),
         cost=(torch.ones(3, 2), tensors(torch.ones(3, 2)) + values([[0.0, 1e39]] * 3, [[0.0, 1e300]] * 3)),
         discount=(0.9, numbers("(0, 1)")),
-        legal=(None, tensors(torch.ones(2, 3, dtype=torch.bool))),
-        terminal=(None, tensors(torch.zeros(2, dtype=torch.bool))),
+        legal=(None, values(3, "x", [], torch.ones(3, 2, dtype=torch.bool), torch.zeros(2, 3, dtype=torch.bool))),
+        terminal=(None, values(3, "x", [], torch.zeros(3, dtype=torch.bool), torch.ones(2, dtype=torch.bool))),
         state_names=(None, sequences(("a", "b"), "a", 3, "")),
         control_names=(None, sequences(("a", "b", "c"), "a", 3, "")),
         observation_names=(None, sequences(("a", "b"), "a", 3, "")),
@@ -149,7 +151,9 @@ ENVS = {
         dtype=(torch.float32, dtypes()),
         device=("cpu", devices()),
     ),
-    "problems.tiger": lambda _: case(problems.tiger, discount=(0.9, numbers("(0, 1)")), name=("tiger", texts()), device=("cpu", devices())),
+    "problems.tiger": lambda _: case(
+        problems.tiger, discount=(0.9, numbers("(0, 1)")), name=("tiger", texts()), device=("cpu", devices())
+    ),
     "envs.BeliefEnv": lambda _: case(
         envs.BeliefEnv, lambda made: made.rollout(2),
         model=belief_model(),
@@ -214,7 +218,9 @@ ENVS = {
         damage_threshold=(0.0, numbers("[0, 1)")),
         device=("cpu", devices()),
     ),
-    "envs.repair.RepairPartition.forward": lambda _: case(model().partition, y=(state(), no_states(state(), "belief", "location"))),
+    "envs.repair.RepairPartition.forward": lambda _: case(
+        model().partition, y=(state(), no_states(state(), "belief", "location"))
+    ),
     "envs.SinglePart": lambda _: case(SinglePart(), y=(state(), no_states(state()))),
     "problems.Problem": lambda _: case(
         problems.Problem,
@@ -244,7 +250,9 @@ ENVS = {
 }
 
 MODULES = {
-    "modules.repair.GreedyRepair": lambda _: case(GreedyRepair, model=repair_model(), damage_threshold=(0.0, numbers("[0, 1)"))),
+    "modules.repair.GreedyRepair": lambda _: case(
+        GreedyRepair, model=repair_model(), damage_threshold=(0.0, numbers("[0, 1)"))
+    ),
     "modules.repair.GreedyRepair.forward": lambda _: on_entries(greedy(), "belief", "location"),
     "modules.repair.UrgencyRepair": lambda _: case(
         repair_modules.UrgencyRepair, lambda made: made(state()), model=repair_model(), exponent=(3.0, numbers("[0, inf)"))
@@ -346,7 +354,7 @@ MODULES = {
         **simulation(),
     ),
     "modules.PolicyCost.forward": lambda _: on_tensordict(policy_cost(), (state(), states(state()))),
-    "modules.ZeroCost": lambda _: on_entries(ZeroCost(), "belief"),
+    "modules.ZeroCost": lambda _: on_tensordict(ZeroCost(), (state(), values(None, 3, "x", {}, []))),
     "modules.repair.SteadyStateCost": lambda _: case(repair_modules.SteadyStateCost, model=repair_model()),
     "modules.repair.SteadyStateCost.forward": lambda _: on_entries(repair_modules.SteadyStateCost(model()), "belief"),
     "modules.repair.NeverRepairCost": lambda _: case(NeverRepairCost, model=repair_model()),

@@ -48,6 +48,7 @@ from _valid import (
 )
 
 from torchrl_pomdp import checks, evaluation, files, noise, report, reproduce, tensor_checks
+from torchrl_pomdp.envs import repair
 from torchrl_pomdp.modules import ZeroCost
 
 __all__ = ["FILES", "REPORTS"]
@@ -100,8 +101,8 @@ REPORTS = {
         report.effort,
         iterations=(ITERATIONS, sequences(ITERATIONS, None, 3, {}, {"parts": {}}, {"parts": 3}, {"parts": {"a": {}}})),
     ),
-    "report.trajectory_figure": lambda _: case(
-        report.trajectory_figure,
+    "envs.repair.trajectory_figure": lambda _: case(
+        repair.trajectory_figure,
         model=repair_model(),
         trajectory=(greedy()(state()), [
             *no_states(greedy()(state()), "belief", "location"), *(Hostile("no action", state(), names=("action",)),)
@@ -145,7 +146,7 @@ REPORTS = {
         scale=(1.0, numbers("(0, inf)")),
         seed=(0, seeds()),
     ),
-    "reproduce.plan": lambda _: case(reproduce.plan, **an_experiment()),
+    "reproduce.plan": lambda _: case(reproduce.plan, **an_experiment(), device=("cpu", devices())),
     "reproduce.reproduce": lambda folder: case(
         quick_reproduce,
         **an_experiment(),

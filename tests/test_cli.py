@@ -111,7 +111,7 @@ def test_evaluate_by_name_and_online(policy, capsys):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        ("train nosuch", "problem must be one of grid5x4, grid6x6, line3, linear20, two_robots20, got 'nosuch'"),
+        ("train nosuch", "a file .toml or .POMDP, or module:function, got 'nosuch'"),
         ("train line3 --states 0", "states must be at least 1, got 0"),
         ("train line3 --online-states -5", "online_states must be at least 0, got -5"),
         ("train line3 --iterations 0", "iterations must be at least 1, got 0"),
@@ -127,7 +127,7 @@ def test_evaluate_by_name_and_online(policy, capsys):
         ("train line3 --out /proc/run", "out must be a folder that can be written"),
         ("evaluate nowhere.pt", "there is no checkpoint nowhere.pt"),
         ("evaluate FILE", "is damaged or no"),
-        ("evaluate greedy --problem nosuch", "problem must be one of"),
+        ("evaluate greedy --problem nosuch", "problem must be a preset"),
         ("evaluate greedy --states 0", "states must be"),
         ("evaluate greedy --trajectories 0", "trajectories must be"),
         ("evaluate greedy --seed -1", "seed must be"),

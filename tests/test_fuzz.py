@@ -18,16 +18,17 @@ from pathlib import Path
 import pytest
 from _hostile import Hostile
 from _refusals_planning import ENVS, MODULES
+from _refusals_problems import PROBLEMS
 from _refusals_results import FILES, REPORTS
 from _refusals_training import COLLECTORS, TRAINERS
 from _valid import Case
 
-CASES: dict[str, Callable[[Path], Case]] = {**ENVS, **MODULES, **COLLECTORS, **TRAINERS, **REPORTS, **FILES}
+CASES: dict[str, Callable[[Path], Case]] = {**ENVS, **MODULES, **PROBLEMS, **COLLECTORS, **TRAINERS, **REPORTS, **FILES}
 
 PUBLIC = (
     *("envs", "envs.repair", "modules", "modules.repair", "problems"),
     *("collectors", "objectives", "trainers", "trainers.run"),
-    *("evaluation", "noise", "report", "reproduce", "files", "checks", "tensor_checks", "identity"),
+    *("controller", "evaluation", "noise", "report", "reproduce", "files", "checks", "tensor_checks", "identity"),
 )
 
 # What is not tried, and why.
@@ -35,7 +36,8 @@ EXEMPT = {
     "names of types": "*.Policy *.TerminalCost *.StateGenerator *.StateSampler *.OnLabels problems.Symmetry",
     "tables and constants": "*.PRESETS *.REPAIR *.ALGORITHMS *.BASE_POLICIES *.EXPERIMENTS *.OPTIMA *.PUBLISHED *_SEED",
     "abstract, tried by what they are bases of": "envs.Partition modules.Encoder modules.ClosedFormCost modules.Truncation",
-    "made by the library, not by its users": "*.Comparison *.Estimate *.Iteration *.PartRecord *.Effort *.DamagedFileError",
+    "made by the library, not by its users": "*.Comparison *.Estimate *.Iteration *.PartRecord *.Effort *.DamagedFileError "
+    "*.PartitionReport *.Decision",
     "run at every belief step, on what was checked before": "noise.fold noise.uniform noise.fingerprint noise.permuted",
     "of any object": "identity.*",
 }

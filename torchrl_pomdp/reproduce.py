@@ -173,6 +173,7 @@ def plan(
         ['linear20-pAPI-NT-paper-greedy-scale0.1-seed0', 'linear20-pAPI-T-paper-greedy-scale0.1-seed0']
     """
     check_instance("experiment", experiment, Experiment)
+    check_choice("base", base, ("greedy", "urgency"))
     unknown = [problem for problem in check_sequence("problems", problems, str) if problem not in experiment.problems]
     if unknown:
         raise ValueError(f"problems must be among {experiment.problems} for {experiment.name}, got {unknown[0]!r}")

@@ -21,6 +21,8 @@ UPDATES = 60
 EVALUATION_STATES = 1000
 
 # %%
+# %matplotlib inline
+import matplotlib.pyplot as plt
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -75,7 +77,7 @@ def cost():
     return estimate(discounted_costs(problem.model, policy, problem.start, num_states=EVALUATION_STATES)).mean
 
 
-print(f"untrained: {cost():.0f}")
+learnt = [cost()]
 frames = {"frames_per_batch": 64 * 32, "total_frames": 64 * 32 * UPDATES}
 for batch in Collector(env, actor, auto_register_policy_transforms=False, **frames):
     for _ in range(4):
@@ -88,9 +90,15 @@ for batch in Collector(env, actor, auto_register_policy_transforms=False, **fram
             optimizer.zero_grad()
             total.backward()
             optimizer.step()
+    learnt.append(cost())
 
 # %%
+figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
+axes.semilogy(learnt, label="PPO")
 for name, base in problem.base_policies.items():
     base_cost = estimate(discounted_costs(problem.model, base, problem.start, num_states=EVALUATION_STATES)).mean
+    axes.axhline(base_cost, linestyle="--", color="grey")
+    axes.annotate(name, (0, base_cost))
     print(f"{name}: {base_cost:.0f}")
-print(f"PPO: {cost():.0f}, the optimum: 169")
+axes.set(xlabel="update", ylabel="discounted cost")
+print(f"PPO: {learnt[-1]:.0f}, the optimum: 169")

@@ -199,7 +199,7 @@ def test_a_run_of_it_has_a_folder_of_its_own(tmp_path):
     assert list(run.carry_out(tmp_path / "run")) == ["threshold", "R-NT of threshold", "pAPI-NT 1"]
     best = load_checkpoint(tmp_path / "run" / "best.pt", problem=own["problem"]())
     assert best.problem.name == "machine"
-    with pytest.raises(ValueError, match="differs in .*problem"):
+    with pytest.raises(ValueError, match=r"differs in .*problem"):
         TrainingRun(make_problem("tiger"), "API", config=config, states=20, online_states=0).carry_out(tmp_path / "run")
 
 

@@ -110,6 +110,7 @@ def changed(text, old, new):
 
 
 # The text, where the fault is, and what is said of it.
+# ruff: noqa: E501
 BROKEN = [
     ("", "", "exactly one of preset, repair, tabular and pomdp"),
     ("x = ", ", line 1", "Invalid value"),

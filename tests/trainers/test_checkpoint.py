@@ -244,7 +244,8 @@ def test_damaged_and_foreign_files_are_refused_by_name(path, small):
     [
         {"iteration": "x"}, {"iteration": ["x"]}, {"iteration": -1}, {"iteration": True}, {"iteration": 1.5},
         {"algorithm": "\x1b[2Jgone"}, {"algorithm": None}, {"problem": "grid5x4"}, {"problem": "line4"}, {"problem": ["line3"]},
-        {"spec": {"preset": "line3"}}, {"spec": {"preset": "line3", "partitioned": 1}}, {"spec": 3}, {"spec": {}}, {"config": {"hidden": [8], "nonsense": 1}}, {"config": []},
+        {"spec": {"preset": "line3"}}, {"spec": {"preset": "line3", "partitioned": 1}}, {"spec": 3}, {"spec": {}},
+        {"config": {"hidden": [8], "nonsense": 1}}, {"config": []},
         {"config": {"hidden": [9]}}, {"config": {"seed": -1}}, {"config": {"learning_rate": float("nan")}},
         {"value_parts": [0, 0]}, {"value_parts": [5]}, {"value_parts": 0}, {"value_parts": []}, {"value_parts": ["0"]},
         {"base": "greedy"}, {"base": {"name": "lazy", "digest": ""}}, {"base": {}}, {"format": "torchrl_pomdp policy 2"},

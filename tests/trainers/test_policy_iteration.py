@@ -342,7 +342,7 @@ def test_labels_of_an_interrupted_run_are_not_made_again(line3, tmp_path, monkey
 
 def test_the_algorithms_refuse_partitions_that_do_not_fit(line3):
     greedy = GreedyRepair(line3.model)
-    with pytest.raises(ValueError, match="a single part, 'line3' has 6: take problem.unpartitioned"):
+    with pytest.raises(ValueError, match=r"a single part, 'line3' has 6: take problem\.unpartitioned"):
         api(line3, TINY, greedy)
     with pytest.raises(ValueError, match="at least two stages, problem 'line3' has 1"):
         papi_t(make_problem("line3", partitioned=False), TINY, greedy)

@@ -227,7 +227,7 @@ class Parser:
             self.start = np.eye(1, n, self._element(self.states))[0]
         else:
             at = words.at
-            self.start = self._probabilities(n, "the start states")
+            self.start = self._probabilities(n, "probabilities of start states")
             if abs(self.start.sum() - 1.0) > 1e-5:
                 words.at = at
                 words.fail(f"probabilities of the start states must sum to 1, got {self.start.sum():.7g}")

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_pomdp.checks import check_callable, check_instance
+from torchrl_pomdp.checks import check_callable, check_instance, check_text
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.rollout import Policy, controls_of
 from torchrl_pomdp.tensor_checks import check_entries
@@ -64,15 +64,16 @@ class _CallablePolicy(TensorDictModuleBase):
         return tensordict.set("action", controls_of("policy", self.policy, tensordict.copy()))
 
 
-def as_policy(policy: Any, model: BeliefModel) -> TensorDictModuleBase:
+def as_policy(policy: Any, model: BeliefModel, name: str = "policy") -> TensorDictModuleBase:
     """A policy as a TensorDictModule: itself if it is one, else any callable from feature states to ``"action"``, wrapped.
 
     Args:
         policy: the policy.
         model: the model whose features the callable may read.
+        name: what messages call it.
 
     Raises:
-        TypeError: if it cannot be called.
+        TypeError: if it cannot be called, or is a class.
 
     Examples:
         >>> from torchrl_pomdp.problems import make_problem
@@ -84,4 +85,6 @@ def as_policy(policy: Any, model: BeliefModel) -> TensorDictModuleBase:
     check_instance("model", model, BeliefModel)
     if isinstance(policy, TensorDictModuleBase):
         return policy
-    return _CallablePolicy(check_callable("policy", policy), model)
+    if isinstance(policy, type):
+        raise TypeError(f"{check_text('name', name)} must be a policy, got the class {policy.__name__}: make one of it")
+    return _CallablePolicy(check_callable(check_text("name", name), policy), model)

@@ -215,7 +215,9 @@ class RolloutPolicy(TensorDictModuleBase):
 def _rivals(costs: Tensor, rivals: Tensor) -> Tensor:
     """Which controls ``[N, U]`` may still be best, given their paired costs ``[k, N, U]``; none where only one may.
 
-    A control is beaten when the mean of its paired differences to the best one exceeds its standard error enough.
+    A control is beaten when the mean of its paired differences to the best one exceeds its standard error enough. One
+    contrary trajectory is added to them: where there is little to observe, a few trajectories agree to the last bit, and
+    others do not.
     """
     count = costs.shape[0]
     if count < 2:
@@ -223,8 +225,10 @@ def _rivals(costs: Tensor, rivals: Tensor) -> Tensor:
     mean = (sum_first(costs.clone()) / count).masked_fill(~rivals, torch.inf)
     difference = costs - costs.gather(-1, mean.argmin(-1, keepdim=True).expand(count, -1, 1))
     gap = sum_first(difference.clone()) / count
-    variance = sum_first((difference - gap).square()) / (count - 1)
-    left = rivals & ~(gap > _CLEARLY * (variance / count).sqrt())
+    difference = torch.cat([difference, -gap.unsqueeze(0)])
+    mean = gap * ((count - 1) / (count + 1))
+    variance = sum_first((difference - mean).square()) / count
+    left = rivals & ~(mean > _CLEARLY * (variance / (count + 1)).sqrt())
     return left & (left.sum(-1, keepdim=True) > 1)
 
 

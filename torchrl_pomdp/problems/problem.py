@@ -148,10 +148,9 @@ def _checked_policies(policies: Any, model: BeliefModel) -> dict[str, TensorDict
     check_mapping("base_policies", policies, object)
     if not policies:
         raise ValueError("base_policies is empty: give at least one policy, or None for the myopic one")
-    for name, policy in policies.items():
+    for name in policies:
         check_text("name in base_policies", name)
-        check_callable(f"base_policies[{name!r}]", policy)
-    return {name: as_policy(policy, model) for name, policy in policies.items()}
+    return {name: as_policy(policy, model, f"base_policies[{name!r}]") for name, policy in policies.items()}
 
 
 def _checked_symmetries(symmetries: Any) -> tuple[Symmetry, ...]:

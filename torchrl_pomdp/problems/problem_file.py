@@ -90,7 +90,8 @@ def _built(spec: dict[str, Any], path: Path, text: str | None, device: torch.dev
             raise ValueError(f"{path}: {error.message}") from error
         line = _line_of(text, error.key)
         where = f"{path}, line {line}" if line else str(path)
-        raise ValueError(f"{where}: {' '.join(str(error).split())}") from error
+        told = f"{'.'.join(error.key)}: {error.message}" if error.key else error.message
+        raise ValueError(f"{where}: {' '.join(told.split())}") from error
 
 
 def _line_of(text: str, key: tuple[str, ...]) -> int | None:

@@ -20,7 +20,7 @@ from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.tensor_checks import check_device, check_dtype
 
-__all__ = ["EAST", "FIRST_CHECK", "HALVING_DISTANCE", "NORTH", "SAMPLE", "SOUTH", "WEST", "RockSample"]
+__all__ = ["EAST", "FIRST_CHECK", "HALVING_DISTANCE", "NORTH", "SAMPLE", "SOUTH", "WEST", "RockSample", "offsets"]
 
 DISCOUNT, REWARD, HALVING_DISTANCE = 0.95, 10.0, 20.0
 # The controls before the checks; a check of rock i is FIRST_CHECK + i.

@@ -39,7 +39,7 @@ class SpecError(ValueError):
     """A description of a problem is wrong; ``key`` is the path of the entry, such as ``("repair", "costs")``."""
 
     def __init__(self, key: tuple[str, ...], message: str) -> None:
-        super().__init__(f"{'.'.join(key)}: {message}" if key else message)
+        super().__init__(f"{'.'.join(key)} of spec: {message}" if key else message)
         self.key, self.message = key, message
 
 

@@ -138,7 +138,7 @@ class PolicyIteration:
     ) -> None:
         self.partition = check_instance("problem", problem, Problem).partition
         self.problem, self.config = problem, check_instance("config", config, PolicyIterationConfig)
-        self.base_policy = as_policy(base_policy, problem.model)
+        self.base_policy = as_policy(base_policy, problem.model, "base_policy")
         self.plan = checked_plan(plan, problem)
         self.folder = None if folder is None else check_path("folder", folder)
         self.logger = None if logger is None else check_instance("logger", logger, Logger)
