@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from benchmarks import decisions, engine, where
+from benchmarks import decisions, engine, tabular, where
 from benchmarks.harness import Table, write
 
 FOLDER = Path(__file__).parent
@@ -14,7 +14,7 @@ BENCHMARKS = {
     function.__name__: function
     for function in (
         engine.greedy, engine.batch, engine.network, engine.router, engine.locations, engine.memory, engine.env_step,
-        decisions.decision, decisions.labels, decisions.adaptive, decisions.expectation, where.profile,
+        tabular.updates, decisions.decision, decisions.labels, decisions.adaptive, decisions.expectation, where.profile,
     )
 }  # fmt: skip
 

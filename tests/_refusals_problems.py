@@ -109,7 +109,11 @@ PROBLEMS = {
     ),
     "envs.repair.Graph.from_networkx": lambda _: case(
         repair.Graph.from_networkx,
-        graph=(networkx.path_graph(3), values(None, 3, "x", [], networkx.Graph(), networkx.empty_graph(2))),
+        graph=(networkx.path_graph(3), [
+            *values(None, 3, "x", []),
+            Hostile("no nodes", networkx.Graph(), names=("num_locations",)),
+            Hostile("no edges", networkx.empty_graph(2), names=("edges",)),
+        ]),
         name=("pipe", texts()),
         positions=({0: (0, 0), 1: (1, 0), 2: (2, 0)}, [*mappings(), *values({}, {0: (0, 0)}, {0: "x", 1: (1, 0), 2: (2, 0)})]),
     ),

@@ -303,7 +303,7 @@ def _positions(positions: Any, nodes: Sequence[Any]) -> tuple[list[float], list[
     pairs = []
     for node in nodes:
         place = positions.get(node, ())
-        pair = _sequence("position", place.tolist() if hasattr(place, "tolist") else place)
+        pair = _sequence(f"positions[{shown(node)}]", place.tolist() if hasattr(place, "tolist") else place)
         if len(pair) != 2:
             raise ValueError(f"positions must hold column and row of every node, got {shown(pair)} for {shown(node)}")
         pairs.append([check_number(f"position of {shown(node)}", number) for number in pair])
