@@ -86,8 +86,8 @@ class PolicyIterationConfig:
     value_samples: int = 200_000
     """States labelled with a simulated cost for each value network."""
 
-    loss: Literal["soft", "cross_entropy", "cost_weighted", "l2"] = "soft"
-    """Classification loss, see ClassificationLoss; l2 is the paper's."""
+    loss: Literal["soft", "cross_entropy", "cost_weighted", "l2", "advantage"] = "soft"
+    """Classification loss, see ClassificationLoss; l2 is the paper's, advantage is for very many controls and noisy labels."""
 
     learning_rate: float = 1e-3
     """First step size of RMSprop; it falls linearly to zero."""

@@ -47,7 +47,18 @@ def softened(gaps):
     return [w / sum(weights) for w in weights]
 
 
+def advantage():
+    """Logits 0, ln 2, ln 4 and 0, ln 2 against the advantages in their unit."""
+    logits = [[0.0, math.log(2.0), math.log(4.0)], [0.0, math.log(2.0)]]
+    advantages = [[20 / 3, 20 / 3 - 4, 20 / 3 - 16], [-1.5, 1.5]]
+    deviations = [math.sqrt(sum(a * a for a in row) / len(row)) for row in advantages]
+    units = [math.sqrt(deviation * sum(deviations) / 2) for deviation in deviations]
+    rows = zip(logits, advantages, units, strict=True)
+    return sum(sum((v - a / unit) ** 2 for v, a in zip(row, each, strict=True)) / len(row) for row, each, unit in rows) / 2
+
+
 EXPECTED = {
+    "advantage": advantage(),
     "l2": ((P1[0] - 1) ** 2 + P1[1] ** 2 + P1[2] ** 2 + P2[0] ** 2 + (P2[1] - 1) ** 2) / 2,
     "cross_entropy": -(math.log(P1[0]) + math.log(P2[1])) / 2,
     "cost_weighted": ((P1[1] * 4 + P1[2] * 16) / 20 + P2[0] * 3 / 3) / 2,

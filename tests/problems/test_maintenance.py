@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from itertools import product
 
 import pytest
@@ -9,7 +10,7 @@ from tensordict import TensorDict
 from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.evaluation import discounted_costs, estimate
 from torchrl_pomdp.problems.check import check_belief_model
-from torchrl_pomdp.problems.maintenance import PeriodicInspection, RandomWear, ReplaceFailed, maintenance
+from torchrl_pomdp.problems.maintenance import PeriodicInspection, RandomWear, ReplaceFailed, WearEncoder, maintenance
 from torchrl_pomdp.problems.maintenance_model import INSPECT, REPLACE, Component, MaintenanceModel
 
 # Mean discounted costs with their standard errors, as published: replace failed components only.
@@ -175,6 +176,18 @@ def test_random_states_fit_the_model_and_belong_to_their_keys():
     assert ((failed == 0) | (failed == 1)).all()
     assert 0.15 < float(failed.mean()) < 0.25
     assert (problem.pessimistic_cost.costs(y) > 0).all()
+
+
+def test_encoding_by_hand():
+    model = small()
+    belief = torch.tensor([[0.25, 0.75, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    y = TensorDict({"belief": belief.expand(2, 2, 3), "time": torch.tensor([0, 6])}, [2])
+    encoder = WearEncoder(model)
+    ends = [[1.0, math.exp(-6 / 3), math.exp(-6 / 10)], [0.0, 1.0, 1.0]]
+    expected = [[0.25, 0.75, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, *end] for end in ends]
+    assert torch.allclose(encoder(y), torch.tensor(expected, dtype=torch.float64))
+    assert torch.equal(encoder.encode_rows(y, torch.tensor([1, 0])), encoder(y).flip(0))
+    assert encoder(y[0]).shape == (encoder.num_features,)
 
 
 def test_environment_keeps_its_specs():

@@ -59,7 +59,7 @@ def read_pomdp(
     if path.stat().st_size > _MOST_BYTES:
         raise ValueError(f"{path} must hold at most {_MOST_BYTES} bytes, got {path.stat().st_size}")
     text = path.read_bytes().removeprefix(b"\xef\xbb\xbf").decode("latin-1")
-    return parse_pomdp(text, path.name or "file", dtype=dtype, device=device)
+    return parse_pomdp(text, path.name if path.name.isprintable() else repr(path.name), dtype=dtype, device=device)
 
 
 def parse_pomdp(

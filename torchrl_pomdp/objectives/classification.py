@@ -16,7 +16,7 @@ from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, 
 
 __all__ = ["ClassificationLoss"]
 
-LossName = Literal["soft", "cross_entropy", "cost_weighted", "l2"]
+LossName = Literal["soft", "cross_entropy", "cost_weighted", "l2", "advantage"]
 # Temperature of the soft targets as a fraction of the state's sum of gaps.
 _TEMPERATURE = 0.1
 
@@ -30,6 +30,11 @@ class ClassificationLoss(LabelLoss):
     * ``"cross_entropy"``: negative log-probability of the rollout control.
     * ``"cost_weighted"``: the expected gap :math:`\sum_u\pi(u)\,(\tilde Q(y,u)-\min\tilde Q)`, divided by the state's sum
       of gaps, so that a wrong control matters as much as it costs and no state outweighs the others.
+    * ``"advantage"``: squared distance of the logits from the advantages, mean Q-factor of the state's legal controls minus
+      their own. Where there are hundreds of controls and few trajectories the best one of a label is chance; the regression
+      learns from all Q-factors and averages their noise over the states. The unit is the geometric mean of two standard
+      deviations of the Q-factors, the state's and the mean of the batch's: by the state's alone rare large costs, which
+      raise it, would count for too little, by the batch's alone the noisiest states would count for all.
 
     Args:
         policy: policy that writes ``"logits"``; a :class:`~torchrl_pomdp.modules.PolicyNetwork` or a partitioned one.
@@ -134,4 +139,20 @@ def _soft(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:
     return -(target * logits.log_softmax(-1).masked_fill(~legal, 0.0)).sum(-1)
 
 
-_LOSSES = {"soft": _soft, "l2": _l2, "cross_entropy": _cross_entropy, "cost_weighted": _cost_weighted}
+def _advantage(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:
+    legal = torch.isfinite(logits)
+    count = legal.sum(-1, keepdim=True)
+    advantage = (gaps.sum(-1, keepdim=True) / count - gaps).masked_fill(~legal, 0.0)
+    deviation = (advantage.square().sum(-1, keepdim=True) / count).sqrt()
+    unit = (deviation * deviation.mean()).sqrt().clamp_min(torch.finfo(gaps.dtype).tiny)
+    error = (logits.masked_fill(~legal, 0.0) - advantage / unit).square()
+    return (error / count).sum(-1)
+
+
+_LOSSES = {
+    "soft": _soft,
+    "l2": _l2,
+    "cross_entropy": _cross_entropy,
+    "cost_weighted": _cost_weighted,
+    "advantage": _advantage,
+}

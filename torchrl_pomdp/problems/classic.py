@@ -61,7 +61,7 @@ def tiger(discount: float = 0.95, *, name: str = "tiger", device: torch.device |
 
     Listening costs 1 and is right with probability 0.85; the door of the tiger costs 100, the other pays 10. After a door
     is opened the tiger is placed anew. The base policy ``listen``, which opens no door, is a poor one; ``myopic`` opens one
-    where that costs less than listening.
+    where that costs less than listening. What trains it: ``torchrl-pomdp train tiger --algorithm API --samples-per-part 500``.
 
     Args:
         discount: :math:`\alpha`.
@@ -97,6 +97,7 @@ def crying_baby(discount: float = 0.9, *, name: str = "crying_baby", device: tor
     A stage costs 10 if the baby is hungry and 5 more if it is fed. Fed, it is full; a full one that is ignored gets hungry with
     probability 0.1, a hungry one stays so. It cries with probability 0.8 if it is hungry and 0.1 if it is full. It starts full.
     The base policy ``hungry`` feeds a baby that is more likely hungry than not; ``feed`` always does, a poor one.
+    What trains it: ``torchrl-pomdp train crying_baby --algorithm API --base feed --samples-per-part 500``.
 
     Args:
         discount: :math:`\alpha`.

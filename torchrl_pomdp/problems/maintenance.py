@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.modules.encoders import Encoder
 from torchrl_pomdp.modules.rollout import Policy
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
 from torchrl_pomdp.noise import fold, uniform
@@ -16,7 +17,15 @@ from torchrl_pomdp.problems.maintenance_model import INSPECT, REPLACE, Component
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.tensor_checks import check_device, check_entries, check_keys
 
-__all__ = ["NewComponents", "PeriodicInspection", "RandomWear", "RemainingStages", "ReplaceFailed", "maintenance"]
+__all__ = [
+    "NewComponents",
+    "PeriodicInspection",
+    "RandomWear",
+    "RemainingStages",
+    "ReplaceFailed",
+    "WearEncoder",
+    "maintenance",
+]
 
 COMPONENTS = (
     Component(30, 1.00, 20, 0.80, ((0.82, 0.13, 0.05, 0), (0, 0.87, 0.09, 0.04), (0, 0, 0.91, 0.09), (0, 0, 0, 1))),
@@ -28,6 +37,8 @@ COMPONENTS = (
 PENALTY = 3.0 * sum(component.replacement_cost for component in COMPONENTS)
 # What a key's independent streams of uniforms are for.
 _TIME, _LEVELS, _KIND = range(3)
+# Stages over which what is left tells the encoder of the end.
+_SCALES = (3.0, 10.0)
 # The best inspection period and replacement threshold for each k, found by a search over both.
 INSPECTIONS = {1: (35, 2), 2: (35, 2), 3: (35, 2), 4: (26, 2), 5: (3, 1)}
 
@@ -198,6 +209,45 @@ class RemainingStages(ClosedFormCost):
         return self.table[y.get("time")]
 
 
+class WearEncoder(Encoder):
+    """What the networks see: the components' beliefs, how many have failed (one-hot), and the stages that are left.
+
+    Near the end less and less pays. The stages left are therefore three smooth numbers: their share of all stages, and two that
+    rise from zero in the last stages. They tell more from fewer labels than the stage one-hot.
+
+    Args:
+        model: the maintenance model.
+
+    Raises:
+        TypeError: if it is none.
+
+    Examples:
+        >>> problem = maintenance(1)
+        >>> WearEncoder(problem.model)(problem.start(torch.arange(2))).shape
+        torch.Size([2, 29])
+    """
+
+    stages: Tensor
+
+    def __init__(self, model: MaintenanceModel) -> None:
+        super().__init__()
+        self.keys, self.dtype = check_instance("model", model, MaintenanceModel).state_keys, model.dtype
+        left = torch.arange(model.num_stages, -1, -1, dtype=torch.float64)
+        stages = torch.stack([left / model.num_stages, *((-left / scale).exp() for scale in _SCALES)], -1)
+        # A table: functions such as exp may round by the number of states.
+        self.register_buffer("stages", stages.to(model.device, model.dtype), persistent=False)
+        self.num_features = model.num_components * (model.num_levels + 1) + 1 + stages.shape[-1]
+
+    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
+        """See :class:`Encoder`."""
+        belief, time = y.get("belief"), y.get("time")
+        if rows is not None:
+            belief, time = belief.index_select(0, rows), time.index_select(0, rows)
+        failed = (belief[..., -1] > 0.5).sum(-1, keepdim=True)
+        count = failed == torch.arange(belief.shape[-2] + 1, device=belief.device)
+        return torch.cat([belief.flatten(-2), count.to(self.dtype), self.stages[time]], -1)
+
+
 def _uniforms(keys: Tensor, purpose: int, count: int) -> Tensor:
     """``count`` uniforms ``[*B, count]`` of each key's stream for one purpose."""
     return uniform(fold(keys, purpose).unsqueeze(-1), torch.arange(count, device=keys.device))
@@ -233,7 +283,9 @@ def maintenance(k: int = 5, *, name: str | None = None, device: torch.device | s
         model,
         NewComponents(model),
         name=f"{k}-out-of-{len(COMPONENTS)} maintenance" if name is None else name,
-        training=(RandomWear(model),),
+        # Half as many failed as it takes for the system to fail.
+        training=(RandomWear(model, (len(COMPONENTS) + 1 - k) / (2 * len(COMPONENTS))),),
         base_policies={first: policies.pop(first), **policies},
         pessimistic_cost=RemainingStages(model),
+        encoder=WearEncoder,
     )

@@ -39,7 +39,9 @@ KNOWN_BAD, UNKNOWN = 0.4, 0.4
 def rocksample(n: int, k: int, *, seed: int = 0, name: str = "rocksample", device: torch.device | str = "cpu") -> Problem:
     """RockSample(n, k), from the usual start: the rover in the western column, in the middle, and nothing known.
 
-    (7, 8) and (11, 11) have the rocks of the papers; otherwise they lie in distinct random cells.
+    (7, 8) and (11, 11) have the rocks of the papers; otherwise they lie in distinct random cells. What trains it well:
+    ``torchrl-pomdp train rocksample11x11 --algorithm API --iterations 1 --samples-per-part 60000 --trajectories 10
+    --max-steps 60 --epochs 15 --visits-per-label 0.3``.
 
     Args:
         n: cells on a side.
