@@ -20,6 +20,7 @@ def inverse_cdf(probs: Tensor, noise: Tensor, dim: int = -1) -> Tensor:
         int64 index of ``noise``'s shape; an index of probability zero is never returned.
 
     Examples:
+        >>> import torch
         >>> inverse_cdf(torch.tensor([0.0, 0.25, 0.75, 0.0]).expand(3, 4), torch.tensor([0.0, 0.25, 0.999])).tolist()
         [1, 2, 2]
     """
@@ -36,6 +37,7 @@ def take_rows(y: TensorDictBase, index: Tensor) -> TensorDictBase:
     row-major ones, and every later step would pay for turning them back.
 
     Examples:
+        >>> import torch
         >>> y = TensorDict({"belief": torch.rand(3, 5).T}, [5])
         >>> take_rows(y, torch.tensor([4, 0]))["belief"].stride()
         (1, 2)
@@ -54,6 +56,7 @@ def put_rows(y: TensorDictBase, index: Tensor, rows: TensorDictBase) -> TensorDi
     """The flat batch ``y`` ``[N]`` with ``rows`` ``[M]`` in the places ``index`` (int64 ``[M]``); ``y`` is left alone.
 
     Examples:
+        >>> import torch
         >>> y = TensorDict({"belief": torch.zeros(3, 5).T}, [5])
         >>> put_rows(y, torch.tensor([4]), TensorDict({"belief": torch.ones(1, 3)}, [1]))["belief"].sum(-1).tolist()
         [0.0, 0.0, 0.0, 0.0, 3.0]

@@ -52,8 +52,10 @@ def table(results: Sequence[Result]) -> str:
     ]
     for result in check_sequence("results", results, Result):
         c = result.comparison
+        digits = _decimals(c.cost)
         lines.append(
-            f"| {result.name} | {interval_text(c.cost)} | {c.difference.mean:+.1f} ± {half_width(c.difference):.1f} | "
+            f"| {result.name} | {interval_text(c.cost)} | {c.difference.mean:+.{digits}f} ± "
+            f"{half_width(c.difference):.{digits}f} | "
             f"{' | '.join(ratio_texts(c.ratio))} |"
         )
     return "\n".join(lines)
@@ -86,9 +88,16 @@ def interval_text(value: Estimate) -> str:
     Examples:
         >>> interval_text(Estimate(mean=15.0, standard_error=5.0, count=2))
         '15.0 ± 9.8'
+        >>> interval_text(Estimate(mean=-21.47, standard_error=0.06, count=1000))
+        '-21.47 ± 0.12'
     """
-    check_instance("value", value, Estimate)
-    return f"{value.mean:.1f} ± {half_width(value):.1f}"
+    digits = _decimals(check_instance("value", value, Estimate))
+    return f"{value.mean:.{digits}f} ± {half_width(value):.{digits}f}"
+
+
+def _decimals(value: Estimate) -> int:
+    """Decimals that tell a mean from what it may also be."""
+    return 2 if half_width(value) < 1 else 1
 
 
 def is_iteration(policy: str) -> bool:

@@ -134,7 +134,7 @@ class Directed:
         (lambda: Graph.from_networkx(networkx.Graph([(0, 1), (2, 3)])), ValueError, "unreachable"),
         (lambda: Graph.from_networkx(networkx.path_graph(2), positions={0: (0, 0)}), ValueError, "row of every node.* for 1"),
         (lambda: Graph.from_networkx(networkx.path_graph(2), positions=[(0, 0)]), TypeError, "positions must map"),
-        (lambda: Graph.from_networkx(networkx.path_graph(1), positions={0: "ab"}), TypeError, "position must be a sequence"),
+        (lambda: Graph.from_networkx(networkx.path_graph(1), positions={0: "ab"}), TypeError, r"\[0\] must be a sequence"),
         (lambda: Graph.from_networkx(networkx.path_graph(1), positions={0: (0, "b")}), TypeError, "position of 0"),
         (lambda: Graph.from_networkx(networkx.path_graph(2), positions={0: (1, 1), 1: (1, 1)}), ValueError, "place of its own"),
         (lambda: Graph.from_networkx(networkx.path_graph(2), name=""), ValueError, "name must be a text"),
