@@ -168,7 +168,7 @@ def test_ends_after_fifty_stages_at_no_further_cost():
 
 
 def test_random_states_fit_the_model_and_belong_to_their_keys():
-    problem = maintenance(5)
+    problem = maintenance(4)
     keys = torch.arange(400)
     y = problem.model.drawn(problem.training[0], keys)
     assert torch.equal(y["belief"][100:103], problem.training[0](keys[100:103])["belief"])

@@ -13,14 +13,29 @@ SIZES = {
     "grid6x6": (36 * 5**36, 5, 5, "6 x 6 grid, 1 robot: 5.2e+26 states"),
     "two_robots20": (20**2 * 5**20, 9, 25, "line of 20, 2 robots: 3.8e+16 states"),
 }
+OTHERS = {
+    "tiger": (2, 3, 2),
+    "crying_baby": (2, 2, 2),
+    "rocksample7x8": (12_545, 13, 3),
+    "rocksample11x11": (247_809, 16, 3),
+    "rocksample15x15": (7_372_801, 20, 3),
+    **{f"maintenance{k}": (50 * 4**5 + 1, 243, 1024) for k in range(1, 6)},
+}
 
 
 def test_the_sizes_of_all_presets():
-    assert set(PRESETS) == set(SIZES)
+    assert set(PRESETS) == {*SIZES, *OTHERS}
     for name, (states, controls, observations, text) in SIZES.items():
         model = make_problem(name).model
         assert (model.num_states, model.num_controls, model.num_observations) == (states, controls, observations)
         assert model.describe().startswith(text)
+    for name, (states, controls, observations) in OTHERS.items():
+        model = make_problem(name).model
+        assert (getattr(model, "num_states", states), model.num_controls, model.num_observations) == (
+            states,
+            controls,
+            observations,
+        )
 
 
 @pytest.mark.parametrize("name", sorted(SIZES))
@@ -34,5 +49,5 @@ def test_training_states_lie_in_their_parts_and_starts_are_startgame(name):
 
 
 def test_unknown_presets_are_refused():
-    with pytest.raises(ValueError, match="unknown preset 'line4'; known presets: grid5x4"):
+    with pytest.raises(ValueError, match="unknown preset 'line4'; known presets: crying_baby, grid5x4"):
         make_problem("line4")

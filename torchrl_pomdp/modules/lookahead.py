@@ -24,9 +24,7 @@ __all__ = ["RolloutPolicy", "cheapest", "check_q_factors", "spread"]
 
 _LEAVES, _ALLOCATIONS = ("control", "observation"), ("uniform", "adaptive")
 # Adaptive allocation: trajectories of the first and of every further round, and the standard errors that settle it.
-_FIRST_ROUND, _NEXT_ROUND, _CLEARLY = 3, 1, 2.2
-# Fewer trajectories whose differences vary by no more than this share settle nothing.
-_ALIKE, _SAME = 8, 1e-3
+_FIRST_ROUND, _NEXT_ROUND, _CLEARLY = 3, 1, 1.3
 
 
 # For every leaf its pair, the place of its trajectory, its state, scenario and weight.
@@ -217,8 +215,9 @@ class RolloutPolicy(TensorDictModuleBase):
 def _rivals(costs: Tensor, rivals: Tensor) -> Tensor:
     """Which controls ``[N, U]`` may still be best, given their paired costs ``[k, N, U]``; none where only one may.
 
-    A control is beaten when the mean of its paired differences to the best one exceeds its standard error enough. Where
-    there is little to observe, a few trajectories agree to the last bit and others do not: their error is not known yet.
+    A control is beaten when the mean of its paired differences to the best one exceeds its standard error enough. One
+    trajectory that says the contrary is added to them: where there is little to observe, a few trajectories agree, even
+    to the last bit, and others do not.
     """
     count = costs.shape[0]
     if count < 2:
@@ -226,11 +225,10 @@ def _rivals(costs: Tensor, rivals: Tensor) -> Tensor:
     mean = (sum_first(costs.clone()) / count).masked_fill(~rivals, torch.inf)
     difference = costs - costs.gather(-1, mean.argmin(-1, keepdim=True).expand(count, -1, 1))
     gap = sum_first(difference.clone()) / count
-    variance = sum_first((difference - gap).square()) / (count - 1)
-    beaten = gap > _CLEARLY * (variance / count).sqrt()
-    if count < _ALIKE:
-        beaten &= variance > (_SAME * gap).square()
-    left = rivals & ~beaten
+    difference = torch.cat([difference, -gap.unsqueeze(0)])
+    mean = gap * ((count - 1) / (count + 1))
+    variance = sum_first((difference - mean).square()) / count
+    left = rivals & ~(mean > _CLEARLY * (variance / (count + 1)).sqrt())
     return left & (left.sum(-1, keepdim=True) > 1)
 
 

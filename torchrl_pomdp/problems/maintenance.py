@@ -259,6 +259,12 @@ def maintenance(k: int = 5, *, name: str | None = None, device: torch.device | s
     Its base policies are ``failed``, replace what has failed, and ``condition``, inspect all periodically and replace what is
     worn. The first of them is the better one, for k = 5 ``condition``; with k below 5 no period is worth its inspections.
 
+    Recipe: ``torchrl-pomdp train maintenance4 --algorithm API --iterations 1 --samples-per-part 15000 --trajectories 1
+    --loss advantage --hidden 64 64 --visits-per-label 0.2 --exploration 0.05 --states 10``, a few minutes on one core; then
+    ``torchrl-pomdp evaluate`` with ``--states 20000``. The networks cost 0.89 times what the base policy costs. With 10000
+    samples it is 0.43 times for k = 1, 0.76 for k = 2, 0.95 for k = 5. For k = 3 it is 0.98 times, and takes more:
+    ``--samples-per-part 30000 --visited-share 0.85 --least-steps 2000``.
+
     Args:
         k: how many components must work, 1 to 5.
 
