@@ -19,6 +19,7 @@ __all__ = [
     "check_flag",
     "check_instance",
     "check_integer",
+    "check_label",
     "check_mapping",
     "check_number",
     "check_path",
@@ -180,6 +181,26 @@ def check_text(name: str, value: Any) -> str:
         raise TypeError(f"{name} must be a text, got {shown(value)}")
     if not value or not value.isprintable():
         raise ValueError(f"{name} must be a text of printable characters, got {shown(value)}")
+    return value
+
+
+def check_label(name: str, value: Any) -> str:
+    """A text that files and folders are called by: at most 100 characters, not beginning with a dot, no slashes.
+
+    Raises:
+        TypeError: if it is no text.
+        ValueError: if it is no such text.
+
+    Examples:
+        >>> check_label("name", "5 x 4 grid")
+        '5 x 4 grid'
+        >>> check_label("name", "../x")
+        Traceback (most recent call last):
+        ValueError: name must have at most 100 characters, no slash, and no dot in front, ...
+    """
+    if len(check_text(name, value)) > 100 or value.startswith(".") or set(value) & set("/\\"):
+        rule = "at most 100 characters, no slash, and no dot in front, since files are called by it"
+        raise ValueError(f"{name} must have {rule}, got {shown(value)}")
     return value
 
 

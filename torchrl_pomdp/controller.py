@@ -212,9 +212,9 @@ class Controller:
             steps = check_integer("steps", given["steps"], 0)
             entries = check_mapping("state", given["state"], (list, int, float))
             spec = self.model.state_spec()
-            core = {key: torch.tensor(entries[key], dtype=spec[key].dtype) for key in self.model.state_keys}
+            core = {key: _tensor(key, entries[key], spec[key].dtype) for key in self.model.state_keys}
             state = self._single("state", TensorDict(core, batch_size=()))
-        except (TypeError, ValueError, KeyError, RuntimeError) as error:
+        except (TypeError, ValueError, KeyError, RuntimeError, OverflowError) as error:
             described = self.model.describe()
             raise ValueError(f"text must be what to_json gave for the model {described}: {error}") from error
         self._state, self._steps = state, steps
@@ -236,3 +236,11 @@ class Controller:
             raise ValueError(
                 f"control must be legal here, got {', '.join(self.model.shown_control(u))}; legal are {'; '.join(names)}"
             )
+
+
+def _tensor(name: str, numbers: Any, dtype: torch.dtype) -> torch.Tensor:
+    """Numbers of a text as a tensor; what is no number of the type is not made one."""
+    found = torch.tensor(numbers)
+    if found.dtype == torch.bool or (found.is_floating_point() and not dtype.is_floating_point):
+        raise ValueError(f"{name} must hold numbers of type {dtype}, got {shown(numbers)}")
+    return torch.tensor(numbers, dtype=dtype)

@@ -284,7 +284,7 @@ def parse_tensors(content: bytes, path: str | PathLike[str], device: torch.devic
         return torch.load(io.BytesIO(content), map_location=device, weights_only=True)
     except Exception as error:  # torch.load raises whatever a foreign file happens to trigger
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise DamagedFileError(f"{path} is damaged or no file of this library, delete it: {reason}") from error
+        raise DamagedFileError(f"{path} is damaged or no file of this library: {reason}") from error
 
 
 def _check_archive(content: bytes) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
 from pathlib import Path
 
@@ -49,8 +50,14 @@ def _own_problem(text: str) -> Problem:
         sys.path.insert(0, str(Path.cwd()))
     try:
         make = getattr(importlib.import_module(name), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise ValueError(f"problem must name a module and a function in it, got {shown(text)}: {error}") from error
+    if not callable(make):
+        raise TypeError(f"{text} must be a function, got {shown(make)}")
+    try:
+        inspect.signature(make).bind()
+    except TypeError as error:
+        raise TypeError(f"{text} must be a function without arguments: {error}") from error
     problem = make()
     if not isinstance(problem, Problem):
         raise TypeError(f"{text} must return a Problem, got {shown(problem)}")

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_pomdp.checks import check_callable, check_instance, check_mapping, check_text
+from torchrl_pomdp.checks import check_callable, check_instance, check_label, check_mapping
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.generators import InPart, Mixture, RandomPlay
 from torchrl_pomdp.envs.partition import Partition, SinglePart
@@ -82,7 +82,7 @@ class Problem:
     spec: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        check_text("name", self.name)
+        check_label("name", self.name)
         check_callable("start", self.start)
         check_callable("encoder", self.encoder)
         model = check_instance("model", self.model, BeliefModel)
@@ -149,7 +149,7 @@ def _checked_policies(policies: Any, model: BeliefModel) -> dict[str, TensorDict
     if not policies:
         raise ValueError("base_policies is empty: give at least one policy, or None for the myopic one")
     for name in policies:
-        check_text("name in base_policies", name)
+        check_label("name in base_policies", name)
     return {name: as_policy(policy, model, f"base_policies[{name!r}]") for name, policy in policies.items()}
 
 

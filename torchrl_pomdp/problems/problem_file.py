@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from torchrl_pomdp.checks import check_path
+from torchrl_pomdp.checks import check_path, shown
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.problems.specs import SpecError, problem_from_spec
 
@@ -55,12 +55,16 @@ def read_problem(path: str | PathLike[str], *, device: torch.device | str = "cpu
         return _built({"pomdp": text}, path, None, device)
     try:
         spec = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise ValueError(_syntax(path, text, str(error))) from error
     except RecursionError as error:
         raise ValueError(f"{path}: is nested too deeply") from error
     if isinstance(spec.get("pomdp"), str):
-        spec["pomdp"] = _text(path.parent / spec["pomdp"])
+        try:
+            spec["pomdp"] = _text(path.parent / spec["pomdp"])
+        except (OSError, ValueError) as error:
+            where = f"{path}, line {_line_of(text, ('pomdp',))}"
+            raise ValueError(f"{where}: pomdp: must be a file that can be read, got {shown(spec['pomdp'])}: {error}") from error
     return _built(spec, path, text, device)
 
 

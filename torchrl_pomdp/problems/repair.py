@@ -141,7 +141,7 @@ def chain_of(chain: Any, degradation: Any) -> Tensor:
         return damage_chain(degradation)
     try:
         return torch.tensor(chain, dtype=torch.float64)
-    except (ValueError, TypeError, RuntimeError) as error:
+    except (ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise ValueError(f"chain must be rows of numbers, one for each level: {error}") from error
 
 

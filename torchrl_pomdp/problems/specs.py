@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -9,7 +10,7 @@ from typing import Any, cast
 
 import torch
 
-from torchrl_pomdp.checks import check_flag, check_mapping, check_text, shown
+from torchrl_pomdp.checks import check_flag, check_label, check_mapping, shown
 from torchrl_pomdp.envs.generators import FixedBelief
 from torchrl_pomdp.envs.partition import SinglePart
 from torchrl_pomdp.envs.pomdp_file import parse_pomdp
@@ -76,7 +77,7 @@ def problem_from_spec(spec: Mapping[str, Any], *, device: torch.device | str = "
     if rest and kind != "preset":
         raise SpecError((next(iter(rest)),), f"unknown entry beside {kind}; allowed are {', '.join(_COMMON)}")
     partitioned = _checked((), "partitioned", lambda: check_flag("partitioned", spec.get("partitioned", True)))
-    name = _checked((), "name", lambda: check_text("name", spec["name"])) if "name" in spec else None
+    name = _checked((), "name", lambda: check_label("name", spec["name"])) if "name" in spec else None
     problem = _BUILDERS[kind](spec[kind], rest, device)
     own = {key: value for key, value in spec.items() if key != "partitioned"}
     problem = replace(problem, name=name or problem.name, spec=own)
@@ -89,7 +90,7 @@ def _checked(path: tuple[str, ...], default: str, build: Callable[[], Any]) -> A
         return build()
     except SpecError:
         raise
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise SpecError((*path, *filter(None, [_named(str(error), path, default)])), str(error)) from error
 
 
@@ -127,13 +128,18 @@ def _one_of(path: tuple[str, ...], value: Any, known: Mapping[str, Callable[...,
 def _numbers(path: str, table: Mapping[str, Any], name: str, dtype: torch.dtype = torch.float64) -> torch.Tensor:
     try:
         return torch.tensor(table[name], dtype=dtype)
-    except (ValueError, TypeError, RuntimeError) as error:
+    except (ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise SpecError((path, name), f"must be an array of numbers, got {shown(table[name])}") from error
 
 
 def _preset(value: Any, options: Mapping[str, Any], device: torch.device) -> Problem:
     if not isinstance(value, str) or value not in PRESETS:
         raise SpecError(("preset",), f"must be one of {', '.join(sorted(PRESETS))}, got {shown(value)}")
+    # Of what the function takes, what a file can say.
+    takes = [key for key in inspect.signature(PRESETS[value]).parameters if key not in ("graph", "start", "name", "device")]
+    for key in options:
+        if key not in takes:
+            raise SpecError((key,), f"{value} takes no such option; allowed are {', '.join(takes) or 'none'}")
     try:
         return make_problem(value, device=device, **options)
     except (ValueError, TypeError) as error:

@@ -184,6 +184,8 @@ def load_checkpoint(
         return _parse(load_tensors(path), problem, device)
     except _OtherProblemError as error:
         raise ValueError(f"{path}: {error}") from error
+    except DamagedFileError as error:
+        raise DamagedFileError(f"{path} is damaged or no checkpoint of this library") from error
     except Exception as error:  # what a foreign file holds can be anything
         raise DamagedFileError(f"{path} is damaged or no checkpoint of this library: {error}") from error
 
