@@ -133,7 +133,7 @@ PROBLEMS = {
         problems.check_belief_model,
         model=(tiger().model, objects(envs.TabularModel, tiger())),
         generator=(tiger().start, not_callable()),
-        seed=(0, integers()),
+        seed=(0, values(None, 1.5, "x", True)),
     ),
     "problems.check_partition": lambda _: case(
         problems.check_partition,

@@ -143,8 +143,11 @@ def test_terminal_states_cost_nothing_not_even_the_terminal_cost(line3):
 def test_listening_forever_has_its_closed_form_cost():
     model = tiger().model
     y = TensorDict({"belief": torch.full((5, 2), 0.5)}, [5])
-    cost = TruncatedRollout(model, always(model, 0))(y, torch.arange(5))
+    cost = TruncatedRollout(model, always(model, 0), max_steps=400)(y, torch.arange(5))
     torch.testing.assert_close(cost, torch.full((5,), 1 / (1 - 0.95)), rtol=1e-5, atol=0)
+    # By default what is left out is what the discount makes negligible.
+    cost = TruncatedRollout(model, always(model, 0))(y, torch.arange(5))
+    torch.testing.assert_close(cost, torch.full((5,), (1 - 0.95**135) / (1 - 0.95)), rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("size", [1, 3, 7, 64, 333])

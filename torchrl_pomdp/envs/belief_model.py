@@ -28,6 +28,8 @@ __all__ = ["INSIGNIFICANT", "BeliefModel", "StateGenerator", "generated"]
 
 # Discount of a stage from which on all costs may be left out: that of the 400th, where it is the paper's 0.99.
 INSIGNIFICANT = 0.018
+# What is better, where it takes no more than so many stages.
+_NEGLIGIBLE, _STAGES = 0.001, 400
 
 StateGenerator = Callable[[Tensor], TensorDictBase]
 """Distribution of feature states: maps int64 keys ``[*B]`` to feature states ``[*B]``, the same key to the same state."""
@@ -111,14 +113,17 @@ class BeliefModel(nn.Module, ABC):
 
     @property
     def horizon(self) -> int:
-        r"""Stages after which discounting has made the rest insignificant: the least m with :math:`\alpha^m\le 0.018`.
+        r"""Stages that a simulation needs: up to where the rest weighs a thousandth, :math:`\alpha^m\le 0.001`.
+
+        Where that takes more than the paper's 400 stages, 400 will do, or as many as it takes to :math:`\alpha^m\le 0.018`.
 
         Examples:
             >>> from torchrl_pomdp.problems import make_problem
             >>> make_problem("linear20").model.horizon, make_problem("tiger").model.horizon
-            (400, 79)
+            (400, 135)
         """
-        return math.ceil(math.log(INSIGNIFICANT) / math.log(self.discount))
+        enough, least = (math.ceil(math.log(rest) / math.log(self.discount)) for rest in (_NEGLIGIBLE, INSIGNIFICANT))
+        return max(min(enough, _STAGES), least)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> BeliefModel:
         """Refuse what would move or convert tensors: tables that are no buffers would stay behind."""

@@ -46,7 +46,8 @@ class TrainingRun:
     Examples:
         >>> import tempfile
         >>> config = PolicyIterationConfig(1, samples_per_part=40, least_steps=1, validation_states=50)
-        >>>         >>> run = TrainingRun(make_problem("line3"), config=config, states=20, online_states=0)
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> run = TrainingRun(make_problem("line3"), config=config, states=20, online_states=0)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     list(run.carry_out(Path(folder) / "run"))
         ['greedy', 'urgency', 'R-NT of greedy', 'pAPI-NT 1']
