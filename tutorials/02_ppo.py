@@ -95,10 +95,10 @@ for batch in Collector(env, actor, auto_register_policy_transforms=False, **fram
 # %%
 figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
 axes.semilogy(learnt, label="PPO")
-for name, base in problem.base_policies.items():
+for color, (name, base) in zip(("C1", "C2"), problem.base_policies.items(), strict=True):
     base_cost = estimate(discounted_costs(problem.model, base, problem.start, num_states=EVALUATION_STATES)).mean
-    axes.axhline(base_cost, linestyle="--", color="grey")
-    axes.annotate(name, (0, base_cost))
+    axes.axhline(base_cost, linestyle="--", color=color, label=name)
     print(f"{name}: {base_cost:.0f}")
 axes.set(xlabel="update", ylabel="discounted cost")
+axes.legend()
 print(f"PPO: {learnt[-1]:.0f}, the optimum: 169")
