@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import Bounded, Categorical, TensorSpec
 
 from torchrl_pomdp.checks import shown
 
@@ -174,3 +175,27 @@ def check_distributions(name: str, value: Tensor) -> Tensor:
             f"{name} must hold probabilities that sum to 1, got a sum of {float(sums[wrong_sum].flatten()[0]):.6g}"
         )
     return value
+
+
+def within(leaf: TensorSpec, value: Tensor) -> bool:
+    """Whether ``value`` ``[*B, ...]`` lies in the bounds of a spec; floating numbers may pass an upper one by rounding."""
+    if isinstance(leaf, Bounded) and leaf.dtype.is_floating_point:
+        low, high = leaf.space.low, leaf.space.high
+        slack = 8 * torch.finfo(leaf.dtype).eps
+        high = high + slack * high.abs().clamp_min(1)
+        return bool(value.amin() >= low.max() and value.amax() <= high.min()) or bool(((value >= low) & (value <= high)).all())
+    return bool(leaf.expand(value.shape).is_in(value))
+
+
+def bounds_text(leaf: TensorSpec) -> str:
+    """The bounds of a spec in a line.
+
+    Examples:
+        >>> bounds_text(Categorical(20)), bounds_text(Bounded(0.0, 1.0, shape=(3,)))
+        ('0 to 19', '0 to 1')
+    """
+    if isinstance(leaf, Categorical):
+        return f"0 to {leaf.n - 1}"
+    if isinstance(leaf, Bounded):
+        return f"{leaf.space.low.min():g} to {leaf.space.high.max():g}"
+    return " ".join(str(leaf).split())

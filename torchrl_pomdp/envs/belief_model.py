@@ -15,14 +15,14 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Binary, Bounded, Categorical, Composite, TensorSpec
+from torchrl.data import Binary, Categorical, Composite
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_number, check_sequence, shown
 from torchrl_pomdp.envs.names import name_of, number_of
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.noise import fingerprint
-from torchrl_pomdp.tensor_checks import check_keys
+from torchrl_pomdp.tensor_checks import bounds_text, check_keys, within
 
 __all__ = ["INSIGNIFICANT", "BeliefModel", "StateGenerator", "generated"]
 
@@ -263,8 +263,8 @@ class BeliefModel(nn.Module, ABC):
                 )
             if value.dtype != leaf.dtype:
                 raise TypeError(f"entry {key!r} of y has dtype {value.dtype}, expected {leaf.dtype}")
-            if value.numel() and not _within(leaf, value):
-                raise ValueError(f"entry {key!r} of y holds values outside its bounds: expected {leaf}")
+            if value.numel() and not within(leaf, value):
+                raise ValueError(f"entry {key!r} of y holds values outside its bounds: expected {bounds_text(leaf)}")
 
     def check_controls(self, y: TensorDictBase, u: Tensor) -> None:
         """Raise unless ``u`` are legal controls in ``y``; its ``"action_mask"`` is believed if it has one.
@@ -382,16 +382,6 @@ def generated(generator: StateGenerator, keys: Tensor, name: str = "generator") 
     if y.batch_size != keys.shape:
         raise ValueError(f"{name} must give one state for each key, {tuple(keys.shape)}, got batch {tuple(y.batch_size)}")
     return y
-
-
-def _within(leaf: TensorSpec, value: Tensor) -> bool:
-    """Whether ``value`` ``[*B, ...]`` lies in the bounds of a spec; floating numbers may pass an upper one by rounding."""
-    if isinstance(leaf, Bounded) and leaf.dtype.is_floating_point:
-        low, high = leaf.space.low, leaf.space.high
-        slack = 8 * torch.finfo(leaf.dtype).eps
-        high = high + slack * high.abs().clamp_min(1)
-        return bool(value.amin() >= low.max() and value.amax() <= high.min()) or bool(((value >= low) & (value <= high)).all())
-    return bool(leaf.expand(value.shape).is_in(value))
 
 
 def _check_index(name: str, value: Any, shape: torch.Size) -> None:

@@ -81,7 +81,7 @@ class InPart:
             return result.view(keys.shape)
         raise ValueError(
             f"no state of part {self.part} ({self.partition.names[self.part]}) among {self.max_tries} candidates "
-            f"of {type(self.proposal).__name__}: choose a proposal that reaches it"
+            f"of {type(self.proposal).__name__}: choose a proposal that reaches it, for a Problem its training states"
         )
 
     def _accepted(self, y: TensorDictBase) -> Tensor:

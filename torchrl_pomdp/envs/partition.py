@@ -51,6 +51,8 @@ class Partition(nn.Module, ABC):
         for part, name in enumerate(names):
             check_text(f"names[{part}] of partition {kind}", name)
         groups = [check_instance(f"stages[{i}] of partition {kind}", stage, (tuple, list)) for i, stage in enumerate(stages)]
+        if len(set(names)) < len(names):
+            raise ValueError(f"names of partition {kind} must differ, got {shown(tuple(names))}")
         staged = [check_integer(f"a part in stages of partition {kind}", part) for stage in groups for part in stage]
         if sorted(staged) != list(range(len(names))):
             raise ValueError(f"stages of partition {kind} must hold every part 0..{len(names) - 1} once, got {shown(stages)}")

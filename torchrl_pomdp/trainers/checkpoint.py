@@ -294,7 +294,8 @@ def _problem(about: dict[str, Any], given: Problem | None, device: torch.device)
         return found
     if spec is None:
         raise _OtherProblemError(
-            f"the policy was trained on {name}, a problem that the file cannot describe: build it and give it as problem="
+            f"the policy was trained on {name}, a problem that the file cannot describe: build it and give it as problem=, "
+            "or name it by --problem on the command line"
         )
     problem = problem_from_spec(spec, device=device)
     if (problem.name, problem_digest(problem)) != (name, own):
