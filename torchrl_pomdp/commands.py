@@ -49,7 +49,7 @@ def train(command: Train) -> None:
     print(f"\n{table(results)}\n", flush=True)
     write_json(out / "provenance.json", provenance())
     best = load_checkpoint(out / "best.pt", problem=problem)
-    title = f"{problem.name}, {command.states} start states; below each policy its ratio to {problem.baseline}"
+    title = f"{problem.name}, {command.states} start states\nbelow: against {problem.baseline}"
     figures = {
         out / "costs.png": partial(cost_figure, results, title),
     }

@@ -47,7 +47,7 @@ def draw(figures: Mapping[Path, Callable[[], Figure]]) -> str:
 
 
 def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
-    """Bars of discounted cost with 95 % intervals.
+    """Bars of discounted cost with 95 % intervals; below each its ratio to the baseline, or its difference where there is none.
 
     Raises:
         TypeError: if something is of the wrong kind.
@@ -59,13 +59,18 @@ def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
     figure = new_figure(1.4 * len(results) + 1.6, 3.6)
     axes = figure.add_subplot()
     means = [result.comparison.cost.mean for result in results]
-    names = [f"{result.name}\n{ratio_texts(result.comparison.ratio)[0]}" for result in results]
+    names = [f"{result.name}\n{_beside(result.comparison)}" for result in results]
     errors = [half_width(result.comparison.cost) for result in results]
     axes.bar(names, means, yerr=errors, capsize=5, color=["#9aa5b1"] + ["#3572a5"] * (len(results) - 1))
     axes.set_ylabel("discounted cost")
     axes.set_title(title)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
+
+
+def _beside(comparison: Comparison) -> str:
+    """A policy against the baseline, in a word."""
+    return f"{comparison.difference.mean:+.3g}" if comparison.ratio is None else ratio_texts(comparison.ratio)[0]
 
 
 def iteration_figure(lines: Mapping[str, Sequence[Comparison]]) -> Figure:
