@@ -105,8 +105,7 @@ class TabularModel(BeliefModel):
         self.state_names = _names("state_names", state_names, self.num_states)
         self.control_names = _names("control_names", control_names, self.num_controls)
         self.observation_names = _names("observation_names", observation_names, self.num_observations)
-        allowed = self.cost if self.illegal is None else self.cost.masked_fill(self.illegal.T.bool(), 0.0)
-        self.max_cost = float(allowed.abs().max())
+        self.max_cost = float(self.cost.masked_fill(~self.legal.T, 0.0).abs().max())
 
     def _expected(self, cost: Tensor, dtype: torch.dtype) -> Tensor:
         """The expected stage costs ``[U, n]`` on the CPU."""
@@ -142,8 +141,7 @@ class TabularModel(BeliefModel):
         going = None
         if terminal is not None:
             terminal = check_tensor("terminal", terminal, (self.num_states,), torch.bool, finite=False).to(self.device)
-            legal = torch.ones_like(self.cost, dtype=torch.bool) if self.illegal is None else self.illegal.T == 0
-            wrong = (legal & terminal & ((self._moves.diagonal() < 1.0) | (self.cost != 0.0))).nonzero()
+            wrong = (self.legal.T & terminal & ((self._moves.diagonal() < 1.0) | (self.cost != 0.0))).nonzero()
             if len(wrong):
                 u, state = wrong[0].tolist()
                 raise ValueError(
