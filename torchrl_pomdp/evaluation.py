@@ -112,7 +112,10 @@ def discounted_costs(
     keys = seed_keys(seed, torch.arange(num_states, device=model.device))
     with progress_bar(None, "step", check_text("name", name), check_flag("progress", progress)) as bar:
         cost = TruncatedRollout(model, _Watched(policy, bar), max_steps=max_steps, terminal_cost=terminal_cost)
-        return cost(model.drawn(start, fold(keys, 0), "start"), fold(keys, 1))
+        costs = cost(model.drawn(start, fold(keys, 0), "start"), fold(keys, 1))
+        if cost.scalar is not None:
+            bar.update(cost.simulated_steps)
+        return costs
 
 
 class _Watched:
@@ -121,6 +124,7 @@ class _Watched:
     def __init__(self, policy: Policy, bar: tqdm) -> None:
         self.policy, self.bar = policy, bar
         self.in_keys = getattr(policy, "in_keys", ())
+        self.scalar_engine = getattr(policy, "scalar_engine", None)
 
     def __call__(self, y: TensorDictBase) -> TensorDictBase:
         self.bar.update(y.batch_size.numel())

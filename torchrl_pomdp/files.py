@@ -13,7 +13,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchrl_pomdp.checks import check_instance, check_path, shown
+from torchrl_pomdp.checks import check_choice, check_instance, check_path, shown
 from torchrl_pomdp.tensor_checks import check_device
 
 if TYPE_CHECKING:
@@ -26,11 +26,16 @@ __all__ = [
     "load_tensors",
     "parse_tensors",
     "read_json",
+    "read_text",
     "save_tensors",
     "tensor_bytes",
     "write_bytes",
     "write_json",
 ]
+
+
+# Larger text files are no problems that anyone has written.
+_MOST_BYTES = 1 << 27
 
 
 class DamagedFileError(ValueError):
@@ -149,6 +154,38 @@ def read_json(path: str | PathLike[str]) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DamagedFileError(f"{path} is damaged, it holds no JSON object: restore it or name another folder")
     return content
+
+
+def read_text(path: str | PathLike[str], encoding: str = "utf-8") -> str:
+    r"""The text of a file that a user has written, without a byte order mark.
+
+    Args:
+        path: the file.
+        encoding: ``utf-8``, or ``latin-1`` for what may have any bytes.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if ``path`` is no plain file, is larger than 128 MiB, or is not text in this encoding.
+        OSError: if it cannot be read.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_bytes(Path(folder) / "a.txt", b"\xef\xbb\xbfdiscount: 0.9")
+        ...     read_text(Path(folder) / "a.txt")
+        'discount: 0.9'
+    """
+    path = check_path("path", path)
+    check_choice("encoding", encoding, ("utf-8", "latin-1"))
+    # What is no plain file, such as a pipe, might never end.
+    if path.exists() and not path.is_file():
+        raise ValueError(f"path must be a file, {path} is none")
+    if path.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"{path} must hold at most {_MOST_BYTES} bytes, got {path.stat().st_size}")
+    try:
+        return path.read_bytes().removeprefix(b"\xef\xbb\xbf").decode(encoding).replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: must be text in UTF-8: {error}") from error
 
 
 def claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:

@@ -23,13 +23,13 @@ def _signed(value: int) -> int:
     return value - (1 << 64) if value >= 1 << 63 else value
 
 
-_GOLDEN = 0x9E3779B97F4A7C15
+GOLDEN = 0x9E3779B97F4A7C15
 _FIRST, _SECOND = _signed(0xBF58476D1CE4E5B9), _signed(0x94D049BB133111EB)
 _LOW_34, _LOW_37, _LOW_33 = (1 << 34) - 1, (1 << 37) - 1, (1 << 33) - 1
 _UNIT = 2.0**-24
 # Rounds of a permutation: pairs of members that no round tells apart are a fraction of 4**-12. Their numbers come from Knuth's
 # linear congruential generator.
-_ROUNDS, _FACTOR, _STEP = 12, 6364136223846793005, 1442695040888963407
+ROUNDS, FACTOR, STEP = 12, 6364136223846793005, 1442695040888963407
 
 
 def _mix(x: Tensor) -> Tensor:
@@ -53,7 +53,7 @@ def fold(keys: Tensor, data: int | Tensor) -> Tensor:
         >>> fold(torch.tensor([1, 2]), 7).tolist() == [int(fold(torch.tensor(k), 7)) for k in (1, 2)]
         True
     """
-    step = _signed((data + 1) * _GOLDEN) if isinstance(data, int) else (data + 1) * _signed(_GOLDEN)
+    step = _signed((data + 1) * GOLDEN) if isinstance(data, int) else (data + 1) * _signed(GOLDEN)
     return _mix(keys + step)
 
 
@@ -97,12 +97,12 @@ def permuted(keys: Tensor, members: Tensor, count: int) -> Tensor:
     if count < 3:
         return place
     state = keys
-    for _ in range(_ROUNDS):
-        state = state * _FACTOR + _STEP
+    for _ in range(ROUNDS):
+        state = state * FACTOR + STEP
         partner = (((state >> 33) & 0x7FFFFFFF) * count >> 31) - place
         partner = partner + (count & (partner >> 63))
         # A pair is swapped, or not, by a bit of its larger place.
-        swap = (state ^ torch.maximum(place, partner) * _signed(_GOLDEN)) * _FIRST < 0
+        swap = (state ^ torch.maximum(place, partner) * _signed(GOLDEN)) * _FIRST < 0
         place = torch.where(swap, partner, place)
     return place
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
-from torchrl_pomdp.envs.rows import inverse_cdf, take_rows
+from torchrl_pomdp.envs.rows import random_control, take_rows
 from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, controls_of
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.noise import fold, uniform
@@ -142,7 +142,7 @@ class StateMemory:
             yield self._retained(y)
             u = controls_of("policy", policy, y.copy())
             model.check_controls(y, u)
-            random = inverse_cdf(y.get("action_mask").to(torch.float32), uniform(fold(keys, _CONTROL), step))
+            random = random_control(y.get("action_mask"), uniform(fold(keys, _CONTROL), step))
             u = torch.where(uniform(fold(keys, _EXPLORE), step) < exploration, random, u)
             noise, scenarios = scenarios.draw(torch.full_like(keys, step), model.observed(y, u), 1)
             _, y = model.advance(y, u, noise)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator, generated
-from torchrl_pomdp.envs.rows import inverse_cdf, put_rows, take_rows
+from torchrl_pomdp.envs.rows import inverse_cdf, put_rows, random_control, take_rows
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import check_distributions, check_keys, check_tensor
 
@@ -183,7 +183,7 @@ class RandomPlay:
     def _controls(self, mask: Tensor, last: Tensor, keep: Tensor, draw: Tensor) -> Tensor:
         """The last controls ``[N]`` where they are legal and kept, else others of the ``mask`` ``[N, U]``."""
         kept = (last >= 0) & (keep < _KEPT) & mask.gather(-1, last.clamp_min(0).unsqueeze(-1)).squeeze(-1)
-        return torch.where(kept, last, inverse_cdf(mask.to(draw.dtype), draw))
+        return torch.where(kept, last, random_control(mask, draw))
 
 
 class FixedBelief:

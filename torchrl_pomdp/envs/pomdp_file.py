@@ -15,13 +15,13 @@ from torchrl_pomdp.envs.pomdp_parser import KEYWORDS, NAME, Elements, Parser
 from torchrl_pomdp.envs.pomdp_tables import Rows
 from torchrl_pomdp.envs.tables import ROUNDING
 from torchrl_pomdp.envs.tabular import TabularModel
-from torchrl_pomdp.files import write_bytes
+from torchrl_pomdp.files import read_text, write_bytes
 from torchrl_pomdp.tensor_checks import check_device, check_dtype
 
 __all__ = ["parse_pomdp", "read_pomdp", "write_pomdp"]
 
-# Largest file that is read, and from where on tables of which less than an eighth is there are kept sparse.
-_MOST_BYTES, _SPARSE, _SHARE = 1 << 27, 1 << 17, 8
+# From where on tables of which less than an eighth is there are kept sparse.
+_SPARSE, _SHARE = 1 << 17, 8
 # For what may stand in a name of a model but not of a file.
 _HYPHENS = str.maketrans(dict.fromkeys(" :*#", "-"))
 
@@ -53,13 +53,9 @@ def read_pomdp(
         (('tiger-left', 'tiger-right'), [[1.0, 1.0], [100.0, -10.0], [-10.0, 100.0]], [0.5, 0.5])
     """
     path = check_path("path", path)
-    # What is no plain file, such as a pipe, might never end.
-    if path.exists() and not path.is_file():
-        raise ValueError(f"path must be a file, {path} is none")
-    if path.stat().st_size > _MOST_BYTES:
-        raise ValueError(f"{path} must hold at most {_MOST_BYTES} bytes, got {path.stat().st_size}")
-    text = path.read_bytes().removeprefix(b"\xef\xbb\xbf").decode("latin-1")
-    return parse_pomdp(text, path.name if path.name.isprintable() else repr(path.name), dtype=dtype, device=device)
+    return parse_pomdp(
+        read_text(path, "latin-1"), path.name if path.name.isprintable() else repr(path.name), dtype=dtype, device=device
+    )
 
 
 def parse_pomdp(

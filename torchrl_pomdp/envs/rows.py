@@ -5,7 +5,7 @@ from __future__ import annotations
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-__all__ = ["inverse_cdf", "put_rows", "take_rows"]
+__all__ = ["inverse_cdf", "put_rows", "random_control", "take_rows"]
 
 
 def inverse_cdf(probs: Tensor, noise: Tensor, dim: int = -1) -> Tensor:
@@ -28,6 +28,24 @@ def inverse_cdf(probs: Tensor, noise: Tensor, dim: int = -1) -> Tensor:
     # Scaling by the rounded total keeps the threshold below it, so trailing zeros are not reached.
     threshold = (noise * cumulative.select(dim, -1)).unsqueeze(dim)
     return (cumulative.narrow(dim, 0, probs.shape[dim] - 1) <= threshold).sum(dim)
+
+
+def random_control(mask: Tensor, noise: Tensor) -> Tensor:
+    """A legal control, each as probable as another.
+
+    Args:
+        mask: legal controls, bool ``[*B, U]``, at least one in a row.
+        noise: uniforms in [0, 1), ``[*B]``.
+
+    Returns:
+        controls, int64 ``[*B]``.
+
+    Examples:
+        >>> import torch
+        >>> random_control(torch.tensor([False, True, True]).expand(3, 3), torch.tensor([0.0, 0.4, 0.6])).tolist()
+        [1, 1, 2]
+    """
+    return inverse_cdf(mask.to(noise.dtype), noise)
 
 
 def take_rows(y: TensorDictBase, index: Tensor) -> TensorDictBase:

@@ -2,18 +2,23 @@ r"""One-step lookahead with rollout at its leaves: the policy :math:`\tilde\mu` 
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
 from typing import Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_choice, check_instance, check_integer
+from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.scalar import Allocation, ScalarEngine
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
@@ -23,8 +28,8 @@ from torchrl_pomdp.tensor_checks import check_distributions, check_keys
 __all__ = ["RolloutPolicy", "cheapest", "check_q_factors", "spread"]
 
 _LEAVES, _ALLOCATIONS = ("control", "observation"), ("uniform", "adaptive")
-# Adaptive allocation: trajectories of the first and of every further round, and the standard errors that settle it.
-_FIRST_ROUND, _NEXT_ROUND, _CLEARLY = 3, 1, 1.3
+# Rounds: trajectories of the first one; of further ones, a fraction of those so far. Standard errors by which one is beaten.
+_FIRST_ROUND, _SLOWLY, _CLEARLY = 3, 8, 1.3
 
 
 # For every leaf its pair, the place of its trajectory, its state, scenario and weight.
@@ -53,6 +58,8 @@ class RolloutPolicy(TensorDictModuleBase):
         allocation: ``"uniform"``: every control gets all trajectories. ``"adaptive"``: they are spent in rounds, and a control
             that the best one clearly beats, by the differences of their paired trajectories, gets no more; a state whose
             decision is settled costs nothing further.
+        seconds: time for the decision of a state. Trajectories are then made as long as it lasts, ``trajectories`` at most and
+            the first three always, and the decision depends on the machine. None: as long as it takes.
         max_steps: largest m, see :class:`TruncatedRollout`.
         truncation: state-dependent m, see :class:`TruncatedRollout`.
         terminal_cost: :math:`\hat J`, see :class:`TruncatedRollout`.
@@ -85,6 +92,7 @@ class RolloutPolicy(TensorDictModuleBase):
         trajectories: int = 10,
         leaves: Literal["control", "observation"] = "control",
         allocation: Literal["uniform", "adaptive"] = "uniform",
+        seconds: float | None = None,
         max_steps: int | None = None,
         truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
@@ -98,6 +106,7 @@ class RolloutPolicy(TensorDictModuleBase):
         self.trajectories = check_integer("trajectories", trajectories, 1, MAX_TRAJECTORIES)
         self.leaves = check_choice("leaves", leaves, _LEAVES)
         self.allocation = check_choice("allocation", allocation, _ALLOCATIONS)
+        self.seconds = None if seconds is None else check_number("seconds", seconds, "(0, inf)")
         self.seed = check_integer("seed", seed)
         self.cost_to_go = TruncatedRollout(
             model,
@@ -117,60 +126,73 @@ class RolloutPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"q_factors"`` ``[*B, U]`` (costs, ``+inf`` where illegal) and ``"action"`` ``[*B]`` (ties to the lower)."""
         q = self.q_factors(tensordict)
-        return tensordict.update({"action": cheapest(q), "q_factors": q})
+        return tensordict.set("action", cheapest(q)).set("q_factors", q)
 
     def keys(self, y: TensorDictBase) -> Tensor:
         """Keys of the scenarios of feature states, int64 ``[*B]``: functions of seed and content."""
         return fold(self.model.fingerprint(y), self.seed)
 
     @torch.no_grad()
-    def q_factors(self, y: TensorDictBase, keys: Tensor | None = None) -> Tensor:
+    def q_factors(self, y: TensorDictBase, keys: Tensor | None = None, seconds: float | None = None) -> Tensor:
         r""":math:`\tilde Q(y,u)` ``[*B, U]``, ``+inf`` where the control is illegal.
 
         Args:
             y: feature states ``[*B]``.
             keys: keys of their scenarios ``[*B]``, for states that shall share them; by default those of :meth:`keys`.
+            seconds: time for each state; by default that of the policy.
         """
+        seconds = self.seconds if seconds is None else seconds
+        engine = self.cost_to_go.scalar
+        if engine is not None and engine.closed:
+            return self._compiled(engine, y, keys, seconds)
         self.model.check_state(y)
         shape = (*y.batch_size, self.model.num_controls)
         if y.batch_size.numel() == 0:
             return torch.zeros(shape, dtype=self.model.dtype, device=self.model.device)
         flat = self.model.derive(y, ("action_mask",)).reshape(-1)
         leaves = self.model.num_controls * (self.model.num_observations if self.leaves == "observation" else 1)
-        trajectories = leaves * max(self._rounds())
+        trajectories = leaves * int(self._allocation(seconds).rounds.max())
         size, threads = blocks(flat.shape[0], trajectories, self.cost_to_go.chunk_rows, self.model.device)
-        if keys is not None and check_keys("keys", keys).shape != y.batch_size:
-            raise ValueError(f"keys must be one for each state, {tuple(y.batch_size)}, got {tuple(keys.shape)}")
-        keys = self.keys(flat) if keys is None else keys.reshape(-1)
+        keys = self.keys(flat) if keys is None else _checked_keys(keys, y).reshape(-1)
         parts = list(zip(flat.split(size), keys.split(size), strict=True))
-        return torch.cat(map_threads(lambda part: self._q_factors(*part), parts, threads)).view(shape)
+        return torch.cat(map_threads(lambda part: self._q_factors(*part, seconds), parts, threads)).view(shape)
 
-    def _q_factors(self, y: TensorDictBase, keys: Tensor) -> Tensor:
+    def _compiled(self, engine: ScalarEngine, y: TensorDictBase, keys: Tensor | None, seconds: float | None) -> Tensor:
+        """:meth:`q_factors` by the compiled loop."""
+        if keys is not None:
+            keys = _checked_keys(keys, y).reshape(-1)
+        q, steps = engine.q_factors(y, keys, self.seed, self._allocation(seconds))
+        self.cost_to_go.count(steps)
+        return torch.from_numpy(q).view(*y.batch_size, self.model.num_controls)
+
+    def _allocation(self, seconds: float | None) -> Allocation:
+        return Allocation(
+            *_plan(self.trajectories, self.allocation == "adaptive" or seconds is not None),
+            observations=self.leaves == "observation",
+            clearly=_CLEARLY if self.allocation == "adaptive" else np.inf,
+            seconds=seconds,
+        )
+
+    def _q_factors(self, y: TensorDictBase, keys: Tensor, seconds: float | None) -> Tensor:
         """Q-factors ``[N, U]`` of a flat batch with the keys ``[N]``."""
         mask, core = y.get("action_mask"), y.select(*self.model.state_keys)
         costs = torch.zeros((self.trajectories, *mask.shape), dtype=self.model.dtype, device=mask.device)
         made = torch.zeros_like(costs, dtype=torch.bool)
         rivals, spent = mask, 0
-        for count in self._rounds():
+        allocation = self._allocation(None if seconds is None else seconds * keys.numel())
+        for count in (int(count) for stretch in allocation.stretches() for count in stretch):
             state, u = rivals.nonzero(as_tuple=True)
             if state.numel() == 0:
                 break
-            members = spread(self.trajectories)[spent : spent + count].to(mask.device)
+            members = torch.from_numpy(allocation.order[spent : spent + count]).to(mask.device)
             spent += count
             costs[spent - count : spent, state, u] = self._trajectory_costs(core, state, u, members, keys)
             made[spent - count : spent] = rivals
-            rivals = _rivals(costs[:spent], rivals)
+            if self.allocation == "adaptive":
+                rivals = _rivals(costs[:spent], rivals)
         q = _combine(costs, made, mask)
         check_q_factors(q, mask)
         return q
-
-    def _rounds(self) -> list[int]:
-        """Numbers of trajectories of each control that are simulated one after the other."""
-        if self.allocation == "uniform":
-            return [self.trajectories]
-        first = min(_FIRST_ROUND, self.trajectories)
-        rest = self.trajectories - first
-        return [first] + [min(_NEXT_ROUND, rest - i) for i in range(0, rest, _NEXT_ROUND)]
 
     def _trajectory_costs(self, core: TensorDictBase, state: Tensor, u: Tensor, members: Tensor, keys: Tensor) -> Tensor:
         r""":math:`\hat g(y,u)+\alpha\tilde J` of P state-control pairs for the trajectories ``members`` ``[n]``: ``[n, P]``."""
@@ -210,6 +232,23 @@ class RolloutPolicy(TensorDictModuleBase):
         y, control = take_rows(pairs, pair), u[pair]
         scenarios = self._scenarios(pair, each, members, keys).observe(model.observed(y, control))
         return pair, each, model.estimator(y, control, observation), scenarios, weight
+
+
+@lru_cache(maxsize=64)
+def _plan(trajectories: int, stepwise: bool) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The order of the trajectories, and the numbers that are made in every round."""
+    rounds, left = [], trajectories
+    while left:
+        spent = trajectories - left
+        rounds.append(min(left, max(1, spent // _SLOWLY) if spent else _FIRST_ROUND) if stepwise else left)
+        left -= rounds[-1]
+    return spread(trajectories).numpy(), np.array(rounds)
+
+
+def _checked_keys(keys: Tensor, y: TensorDictBase) -> Tensor:
+    if check_keys("keys", keys).shape != y.batch_size:
+        raise ValueError(f"keys must be one for each state, {tuple(y.batch_size)}, got {tuple(keys.shape)}")
+    return keys
 
 
 def _rivals(costs: Tensor, rivals: Tensor) -> Tensor:
@@ -271,7 +310,8 @@ def cheapest(q: Tensor) -> Tensor:
     if q.numel() == 0:
         return torch.zeros(q.shape[:-1], dtype=torch.int64, device=q.device)
     value, u = q.min(-1)
-    if not bool(torch.isfinite(value).all()):
+    # For a single state the time of every operation counts; an infinite sum is looked at again.
+    if not math.isfinite(value.sum().item()) and not bool(torch.isfinite(value).all()):
         raise ValueError("action_mask must allow at least one control in every state, got none")
     return u
 

@@ -75,13 +75,15 @@ class MultistepLookahead(TensorDictModuleBase):
         flat = y.select(*self.model.state_keys).reshape(-1)
         if flat.batch_size[0] == 0:
             return self.policy.q_factors(y)
-        q = [self._expand(block, self.policy.keys(block), self.depth) for block in flat.split(_BLOCK)]
+        # With a time for each decision, roots have trees of their own.
+        size = _BLOCK if self.policy.seconds is None else 1
+        q = [self._expand(block, self.policy.keys(block), self.depth) for block in flat.split(size)]
         return torch.cat(q).view(*y.batch_size, -1)
 
     def _expand(self, y: TensorDictBase, keys: Tensor, depth: int) -> Tensor:
         """Q-factors ``[N, U]`` of states whose trees have the keys ``keys`` ``[N]``."""
         if depth == 1:
-            return self.policy.q_factors(y, keys)
+            return self._rolled_out(y, keys)
         model, mask = self.model, self._worthwhile(y, keys)
         state, u = mask.nonzero(as_tuple=True)
         pairs = take_rows(y, state)
@@ -103,6 +105,12 @@ class MultistepLookahead(TensorDictModuleBase):
         check_q_factors(q, mask)
         return q
 
+    def _rolled_out(self, y: TensorDictBase, keys: Tensor) -> Tensor:
+        """One-step Q-factors ``[N, U]`` of states of a tree, which share the time of the decision."""
+        seconds = self.policy.seconds
+        calls = 1 if self.margin is None else self.depth
+        return self.policy.q_factors(y, keys, None if seconds is None else seconds / (calls * max(1, keys.numel())))
+
     def _worthwhile(self, y: TensorDictBase, keys: Tensor) -> Tensor:
         """Controls that are expanded, bool ``[N, U]``: the legal ones that are not dominated."""
         if self.margin is None:
@@ -110,7 +118,7 @@ class MultistepLookahead(TensorDictModuleBase):
             if not bool(mask.any(-1).all()):
                 raise ValueError("action_mask must allow at least one control in every state, got none")
             return mask
-        q = self.policy.q_factors(y, keys)
+        q = self._rolled_out(y, keys)
         best = q.amin(-1, keepdim=True)
         return torch.isfinite(q) & (q <= best + self.margin * best.abs())
 

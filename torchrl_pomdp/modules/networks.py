@@ -13,9 +13,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_sizes
+from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.modules.encoders import Encoder, transformed
 from torchrl_pomdp.modules.rowwise import RowLinear, rowwise
+from torchrl_pomdp.modules.scalar import Limited, ScalarEngine
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
 from torchrl_pomdp.tensor_checks import check_entries
 
@@ -58,6 +60,10 @@ class LocalNetwork(TensorDictModuleBase):
         rows = torch.arange(flat.batch_size[0], device=flat.device)
         entries = evaluate_networks([self], flat, rows, [rows.numel()])
         return tensordict.update(entries.reshape(tensordict.batch_size))
+
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+        """Compiled simulations, see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`."""
+        return self.encoder.scalar_engine([self], model, limits)
 
     @property
     def kind(self) -> tuple[Any, ...]:

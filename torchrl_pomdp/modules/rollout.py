@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -14,6 +14,7 @@ from torchrl_pomdp.checks import check_callable, check_flag, check_instance, che
 from torchrl_pomdp.envs.belief_model import INSIGNIFICANT, BeliefModel
 from torchrl_pomdp.envs.rows import put_rows, take_rows
 from torchrl_pomdp.modules.compiling import compiled
+from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.tensor_checks import check_keys
@@ -128,6 +129,7 @@ class TruncatedRollout(nn.Module):
 
     Attributes:
         simulated_steps: belief steps made so far.
+        scalar: the compiled loop that simulates; None: tensors do.
 
     Raises:
         TypeError: if an argument is of the wrong kind.
@@ -187,7 +189,7 @@ class TruncatedRollout(nn.Module):
         self._keys = _read_by(base_policy)
         if self._keys and truncation is not None:
             self._keys += truncation.in_keys
-        self._compiled = check_flag("compile", compile)
+        self._compile = check_flag("compile", compile)
         powers = model.discount ** torch.arange(max_steps + 1, dtype=torch.float64)
         self.register_buffer("_discounts", powers.to(model.device, model.dtype), persistent=False)
         self._prepare()
@@ -197,11 +199,17 @@ class TruncatedRollout(nn.Module):
         self.simulated_steps = 0
         # Several threads may share a rollout.
         self._lock = Lock()
-        self._transition = compiled(self._policy_and_step) if self._compiled else self._policy_and_step
+        limits = Limited(self.max_steps, self.truncation, self.terminal_cost)
+        self.scalar = scalar_engine(self.base_policy, self.model, limits)
+        self._transition = compiled(self._policy_and_step) if self._compile else self._policy_and_step
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the lock, the compiled step and the count: a copy starts its own."""
-        return {key: value for key, value in self.__dict__.items() if key not in ("_lock", "_transition", "simulated_steps")}
+        """All but the lock, the compiled loop and the count: a copy starts its own."""
+        return {
+            key: value
+            for key, value in self.__dict__.items()
+            if key not in ("_lock", "_transition", "scalar", "simulated_steps")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """The inverse of :meth:`__getstate__`."""
@@ -229,11 +237,28 @@ class TruncatedRollout(nn.Module):
         check_integer("count", count, 1, MAX_TRAJECTORIES)
         total = torch.zeros(y.batch_size, dtype=self.model.dtype, device=self.model.device)
         with torch.inference_mode():
-            steps = self._simulate(y, scenarios, count, total)
+            steps = (self._simulate if self.scalar is None else self._compiled)(y, scenarios, count, total)
         check_finite("simulated costs must be finite", total)
+        self.count(steps)
+        return total
+
+    def count(self, steps: int) -> None:
+        """Add to the number of simulated steps."""
         with self._lock:
             self.simulated_steps += steps
-        return total
+
+    def _compiled(self, y: TensorDictBase, scenarios: Scenarios, count: int, total: Tensor) -> int:
+        """:meth:`_simulate` by the compiled loop, chunk by chunk."""
+        steps, engine = 0, cast(ScalarEngine, self.scalar)
+        for rows in torch.arange(len(total)).split(self.chunk_rows):
+            first = slice(int(rows[0]), int(rows[-1]) + 1)
+            costs, made, cut = engine.simulate(y[first], scenarios.rows(rows), count)
+            total[first], steps = costs.to(total.dtype), steps + made
+            if cut is not None:
+                rest = self.model.derive(cut.y, _read_by(cast(TerminalCost, self.terminal_cost)))
+                weight = self._discounts[cut.ages]
+                total[rows[cut.rows]] += terminal_costs(cast(TerminalCost, self.terminal_cost), rest).to(total.dtype) * weight
+        return steps
 
     def _simulate(self, y: TensorDictBase, scenarios: Scenarios, count: int, total: Tensor) -> int:
         """Add the cost of every trajectory to ``total`` ``[N]``; returns the number of belief steps."""

@@ -22,10 +22,10 @@ from torchrl_pomdp.noise import fold, permuted, uniform
 __all__ = ["Scenarios"]
 
 # Variables are remembered as bits of an int64; those that share a bit with another one count as observed with it.
-_BITS = 63
+BITS = 63
 # Steps count from here, above the names of all variables.
-_STEPS = 1 << 32
-_LARGEST = 1.0 - 2.0**-24
+STEPS = 1 << 32
+LARGEST = 1.0 - 2.0**-24
 
 
 class Scenarios(NamedTuple):
@@ -88,7 +88,7 @@ class Scenarios(NamedTuple):
         for robot, name in enumerate(names.unbind(-1)):
             bit = _bit(name)
             first, seen = (self.seen & bit) == 0, seen | bit
-            noise = uniform(self.keys, torch.where(first, name, _STEPS + age * robots + robot))
+            noise = uniform(self.keys, torch.where(first, name, STEPS + age * robots + robot))
             columns.append(self._stratified(noise, first, name, count) if count > 1 else noise)
         return torch.stack(columns, -1), self._replace(seen=seen)
 
@@ -103,8 +103,8 @@ class Scenarios(NamedTuple):
 
 
 def _within_slice(noise: Tensor, groups: Tensor, members: Tensor, name: Tensor, count: int) -> Tensor:
-    return ((permuted(fold(groups, name), members, count) + noise) / count).clamp_max(_LARGEST)
+    return ((permuted(fold(groups, name), members, count) + noise) / count).clamp_max(LARGEST)
 
 
 def _bit(name: Tensor) -> Tensor:
-    return torch.ones_like(name) << (name % _BITS)
+    return torch.ones_like(name) << (name % BITS)

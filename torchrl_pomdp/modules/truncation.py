@@ -32,6 +32,11 @@ class Truncation(ABC):
     in_keys: tuple[str, ...] = ()
     width: int = 0
 
+    @property
+    def rules(self) -> tuple[Truncation, ...]:
+        """The rules that this one joins, or this one."""
+        return (self,)
+
     def start(self, y: TensorDictBase) -> Tensor:
         """What the rule remembers of trajectories that start at ``y`` ``[N]``, with all features: int64 ``[N, w]``."""
         return torch.zeros(*y.batch_size, self.width, dtype=torch.int64, device=y.device)
@@ -172,6 +177,10 @@ class _Either(Truncation):
         self.first, self.second = first, second
         self.in_keys = tuple(dict.fromkeys((*first.in_keys, *second.in_keys)))
         self.width = first.width + second.width
+
+    @property
+    def rules(self) -> tuple[Truncation, ...]:
+        return self.first.rules + self.second.rules
 
     def start(self, y: TensorDictBase) -> Tensor:
         return torch.cat([self.first.start(y), self.second.start(y)], -1)

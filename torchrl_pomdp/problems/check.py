@@ -12,7 +12,7 @@ from torchrl.data import Composite
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
-from torchrl_pomdp.envs.rows import inverse_cdf
+from torchrl_pomdp.envs.rows import random_control
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems.check_laws import (
     MOST_ROWS,
@@ -135,7 +135,7 @@ def _visited(probe: Probe, starts: TensorDictBase, seed: int) -> tuple[TensorDic
     keys = seed_keys(seed, torch.arange(starts.batch_size[0], device=model.device))
     for stage in range(_STAGES):
         noise = noise_of(model, fold(keys, stage + 1), model.noise_dim + 1)
-        u = inverse_cdf(probe.mask(y).to(model.dtype), noise[:, -1])
+        u = random_control(probe.mask(y), noise[:, -1])
         y = probe.advance(y, u, noise[:, :-1])[1].select(*model.state_keys)
         seen.append(y)
     every = torch.cat([each.clone() for each in seen])

@@ -13,7 +13,7 @@ from torchrl_pomdp.checks import check_callable, check_instance, check_integer
 from torchrl_pomdp.config import MAX_STATES
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.partition import Partition
-from torchrl_pomdp.envs.rows import inverse_cdf, take_rows
+from torchrl_pomdp.envs.rows import random_control, take_rows
 from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, controls_of
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 
@@ -169,6 +169,6 @@ def _number(model: BeliefModel, part: Tensor) -> Tensor:
 
 def _random_controls(model: BeliefModel) -> Callable[[TensorDictBase, Tensor], Tensor]:
     def choose(y: TensorDictBase, keys: Tensor) -> Tensor:
-        return inverse_cdf(y.get("action_mask").to(model.dtype), uniform(keys, 0).to(model.dtype))
+        return random_control(y.get("action_mask"), uniform(keys, 0))
 
     return choose

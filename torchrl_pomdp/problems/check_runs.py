@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
-from torchrl_pomdp.envs.rows import inverse_cdf
+from torchrl_pomdp.envs.rows import random_control
 from torchrl_pomdp.modules.rollout import Policy, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.terminal_costs import ZeroCost
@@ -27,8 +27,8 @@ def _some_policy(model: BeliefModel, seed: int) -> Policy:
     """A policy of legal controls that are a function of the state, and differ between states."""
 
     def policy(y: TensorDictBase) -> TensorDictBase:
-        noise = uniform(fold(model.fingerprint(y), seed), 0).to(model.dtype)
-        return y.set("action", inverse_cdf(model.action_mask(y).to(model.dtype), noise))
+        noise = uniform(fold(model.fingerprint(y), seed), 0)
+        return y.set("action", random_control(model.action_mask(y), noise))
 
     return policy
 

@@ -11,13 +11,12 @@ from typing import Any
 import torch
 
 from torchrl_pomdp.checks import check_path, shown
+from torchrl_pomdp.files import read_text
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.problems.specs import SpecError, problem_from_spec
 
 __all__ = ["read_problem"]
 
-# Files beyond are no problems that anyone has written.
-_MOST_BYTES = 1 << 28
 _KEY = re.compile(r"""\s*(?:"([^"]*)"|'([^']*)'|([A-Za-z0-9_-]+))\s*=""")
 _SECTION = re.compile(r"\s*\[\s*([A-Za-z0-9_.-]+)\s*\]")
 
@@ -50,9 +49,9 @@ def read_problem(path: str | PathLike[str], *, device: torch.device | str = "cpu
         ('pipes', 'graph, 1 robot: 3.2e+02 states, 4 controls, 3 observations, discount 0.9')
     """
     path = check_path("path", path)
-    text = _text(path)
     if path.suffix.lower() == ".pomdp":
-        return _built({"pomdp": text}, path, None, device)
+        return _built({"pomdp": read_text(path, "latin-1")}, path, None, device)
+    text = read_text(path)
     try:
         spec = tomllib.loads(text)
     except ValueError as error:
@@ -61,7 +60,7 @@ def read_problem(path: str | PathLike[str], *, device: torch.device | str = "cpu
         raise ValueError(f"{path}: is nested too deeply") from error
     if isinstance(spec.get("pomdp"), str):
         try:
-            spec["pomdp"] = _text(path.parent / spec["pomdp"])
+            spec["pomdp"] = read_text(path.parent / spec["pomdp"], "latin-1")
         except (OSError, ValueError) as error:
             where = f"{path}, line {_line_of(text, ('pomdp',))}"
             raise ValueError(f"{where}: pomdp: must be a file that can be read, got {shown(spec['pomdp'])}: {error}") from error
@@ -75,15 +74,6 @@ def _syntax(path: Path, text: str, message: str) -> str:
         return f"{path}: {message}"
     line = at[1] or max(1, len(text.splitlines()))
     return f"{path}, line {line}: {message[: at.start()]}"
-
-
-def _text(path: Path) -> str:
-    if path.is_file() and path.stat().st_size > _MOST_BYTES:
-        raise ValueError(f"{path}: must have at most {_MOST_BYTES} bytes, got {path.stat().st_size}")
-    try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: must be text in UTF-8: {error}") from error
 
 
 def _built(spec: dict[str, Any], path: Path, text: str | None, device: torch.device | str) -> Problem:

@@ -18,7 +18,7 @@ from torchrl_pomdp.checks import check_choice, check_instance, check_integer, ch
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, parse_tensors, tensor_bytes, write_bytes
 from torchrl_pomdp.identity import digest
-from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork, as_policy
+from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.problems.specs import problem_from_spec
 from torchrl_pomdp.tensor_checks import check_device
@@ -129,11 +129,10 @@ def save_checkpoint(path: str | PathLike[str], checkpoint: Checkpoint) -> None:
     """
     path = check_path("path", path)
     check_instance("checkpoint", checkpoint, Checkpoint)
-    _check_spec(checkpoint.problem)
-    own = checkpoint.problem if checkpoint.problem.spec is None else None
+    described = _described(checkpoint.problem)
     saved = tensor_bytes(_content(checkpoint))
     try:
-        loaded = _parse(parse_tensors(saved, path), own, checkpoint.problem.model.device)
+        loaded = _parse(parse_tensors(saved, path), described, checkpoint.problem.model.device)
     except ValueError as error:
         raise ValueError(f"checkpoint could not be loaded again: {error}") from error
     for name in ("policy", "value"):
@@ -190,16 +189,17 @@ def load_checkpoint(
         raise DamagedFileError(f"{path} is damaged or no checkpoint of this library: {error}") from error
 
 
-def _check_spec(problem: Problem) -> None:
-    """Raise unless the problem is what its spec describes, where it has one."""
+def _described(problem: Problem) -> Problem:
+    """What the problem's spec describes, which must be equal to it; the problem itself where it has none."""
     if problem.spec is None:
-        return
+        return problem
     described = problem_from_spec(problem.spec, device=problem.model.device)
     if (described.name, problem_digest(described)) != (problem.name, problem_digest(problem)):
         raise ValueError(
             f"checkpoint.problem must be what its spec describes, got another problem {problem.name!r}: "
             "with spec=None it is kept by its content alone"
         )
+    return described
 
 
 class _OtherProblemError(ValueError):
@@ -308,7 +308,7 @@ def _parse_base(base: Any, problem: Problem, content: dict[str, Any]) -> TensorD
         return None
     check_instance("base", base, dict)
     name = check_choice("base", base.get("name"), problem.base_policies)
-    policy = as_policy(problem.base_policies[name], problem.model)
+    policy = problem.base_policies[name]
     if base.get("digest") != digest(policy) or content["policy"] != {}:
         raise ValueError(f"base policy {name} is not what it was when the checkpoint was made")
     return policy

@@ -21,7 +21,7 @@ from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import DamagedFileError, check_claimed, write_json
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
-from torchrl_pomdp.modules import PartitionedValue, Policy, as_policy
+from torchrl_pomdp.modules import PartitionedValue, Policy
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
@@ -190,7 +190,7 @@ class _Execution:
             on_labels=self.on_labels,
         )
         untrained_value = PartitionedValue([self.problem.pessimistic_cost] * self.problem.partition.num_parts)
-        untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, as_policy(base, self.problem.model), untrained_value)
+        untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, base, untrained_value)
         if not (self.folder / "best.pt").is_file():
             self._keep("best.pt", untrained)
         summaries = []

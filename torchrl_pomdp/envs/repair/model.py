@@ -131,7 +131,7 @@ class RepairModel(Robots):
         }
         for name, value in tables.items():
             self.register_buffer(name, value.to(device), persistent=False)
-        self._prices, self._chain_rows = tuple(costs.tolist()), chain.tolist()
+        self._prices = tuple(costs.tolist())
         self._stay = self.chain.diagonal().view(-1, 1)
         self._diagonals = list(off_diagonals(self.chain))
         self._overflowing = overflowing_levels(chain)
@@ -245,7 +245,7 @@ class RepairModel(Robots):
         location, repaired = self._move(y, u)
         levels = self._draw_levels(self._columns(planes, location, repaired), location, noise)
         cost = self._stage_cost(planes).view(y.batch_size)
-        return cost, self._successor(y, self._next_planes(planes, location, levels), location)
+        return cost, self._successor(y, self._set_levels(self._degrade_planes(planes), location, levels), location)
 
     def observed(self, y: TensorDictBase, u: Tensor) -> Tensor:
         """The locations where the robots will stand, ``[*B, R]``."""
@@ -319,39 +319,8 @@ class RepairModel(Robots):
             levels.append(level)
         return torch.stack(levels)
 
-    def _next_planes(self, planes: Tensor, location: Tensor, levels: Tensor) -> Tensor:
-        """Planes one step of the chain later, with ``levels`` ``[R, N]`` certain at ``location`` ``[R, N]``."""
-        if not torch.compiler.is_compiling():
-            return self._set_levels(self._degrade_planes(planes), location, levels)
-        # Written level by level, with choices for scatters, the compiler makes one pass of it.
-        places = torch.arange(self.num_locations, dtype=self.dtype, device=planes.device).unsqueeze(-1)
-        # A view by strides is of something that is in memory; else the rows' numbers were computed again for every plane.
-        location, levels = (rows.to(self.dtype).as_strided(rows.shape, rows.stride()) for rows in (location, levels))
-        here = [places == place for place in location]
-        result = []
-        for k, plane in enumerate(self._next_levels(planes)):
-            for at, level in zip(here, levels, strict=True):
-                plane = torch.where(at, (level == k).to(self.dtype), plane)
-            result.append(plane)
-        return torch.stack(result, 1)
-
-    def _next_levels(self, planes: Tensor) -> list[Tensor]:
-        """Probabilities ``[L, N]`` of all levels after one step of the chain, one after the other: for the compiler."""
-        result = []
-        for level in range(self.num_levels):
-            weights = [row[level] for row in self._chain_rows]
-            terms = [planes[:, k] if w == 1 else planes[:, k] * w for k, w in enumerate(weights) if w > 0]
-            plane = sum(terms[1:], terms[0]) if terms else torch.zeros_like(planes[:, 0])
-            result.append(plane.clamp(max=1.0) if level in self._overflowing else plane)
-        if not self._normalise:
-            return result
-        total = sum(result[1:], result[0])
-        return [plane / total for plane in result]
-
     def _degrade_planes(self, planes: Tensor) -> Tensor:
         """One step of the chain in every location: a pass over the planes for each nonzero diagonal."""
-        if torch.compiler.is_compiling():
-            return torch.stack(self._next_levels(planes), 1)
         result = planes * self._stay
         for source, target, probs in self._diagonals:
             result[:, target].addcmul_(planes[:, source], probs)

@@ -68,7 +68,7 @@ class RepairPartition(Partition):
         costs = check_tensor("costs", costs, (None,), finite=False)
         if len(costs) < 2 or not bool((torch.isfinite(costs.float()) & (costs >= 0)).all()):
             raise ValueError(f"costs must be finite and nonnegative for at least 2 levels, got {costs.tolist()}")
-        self._prices = tuple(costs.tolist())
+        self.prices = tuple(costs.tolist())
         # In units below which two columns count as equal: coordinates are rounded.
         columns = graph.columns.double() - graph.columns.double().min()
         columns = columns / (float(columns.max()) or 1.0) * _COLUMN_UNITS
@@ -76,7 +76,7 @@ class RepairPartition(Partition):
 
     def check_fits(self, num_locations: int, num_levels: int, device: torch.device) -> None:
         """Raise unless this is a partition for so many locations and levels, on the same device."""
-        own = len(self.columns), len(self._prices)
+        own = len(self.columns), len(self.prices)
         if own != (num_locations, num_levels):
             raise ValueError(
                 f"partition must be for {num_locations} locations and {num_levels} levels as the model is, "
@@ -98,7 +98,7 @@ class RepairPartition(Partition):
 
     def _density(self, planes: Tensor, location: Tensor) -> Tensor:
         """0 where the damage is mostly left, 1 where balanced, 2 where mostly right: int64 ``[*B]``."""
-        cost = location_costs(planes, self._prices)
+        cost = location_costs(planes, self.prices)
         column = self.columns.view(-1, *([1] * (cost.ndim - 1)))
         # R times the robots' mean column.
         centre = sum_first(self.columns[location].movedim(-1, 0).clone())

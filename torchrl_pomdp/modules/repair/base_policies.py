@@ -8,8 +8,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_number
+from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.repair.partition import location_costs
+from torchrl_pomdp.modules.scalar import Limited, ScalarEngine
 from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["GreedyRepair", "UrgencyRepair"]
@@ -50,7 +52,13 @@ class GreedyRepair(TensorDictModuleBase):
         # [L, L], target by origin: orders targets by distance, then index, and is below `size * size` for all.
         ranks = model.graph.distances.T * size + torch.arange(size).unsqueeze(-1)
         self.register_buffer("ranks", ranks.to(model.device, model.dtype), persistent=False)
-        self.register_buffer("first_moves", _first_moves(model), persistent=False)
+        self.register_buffer("first_moves", first_moves(model), persistent=False)
+
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+        """Compiled simulations, see :class:`~torchrl_pomdp.modules.scalar.ScalarEngine`."""
+        from torchrl_pomdp.modules.repair.scalar import engine, twins
+
+        return engine.repair_engine(twins.greedy, (self.damage_threshold,), self.model, model, limits)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``."""
@@ -76,9 +84,10 @@ class GreedyRepair(TensorDictModuleBase):
 
 
 class UrgencyRepair(TensorDictModuleBase):
-    r"""Go where damage costs most for the way there, and repair: the location that maximises :math:`(b\cdot c)/(d+1)^3`.
+    r"""Go where damage costs most for the way there, and repair: the location that maximises :math:`(b\cdot c-c_0)/(d+1)^3`.
 
-    :math:`b\cdot c` is the expected cost of a location per stage, d the number of moves to it. Ties go to the location,
+    :math:`b\cdot c-c_0` is what a location is expected to cost per stage more than if it were intact, d the number of moves
+    to it. Ties go to the location,
     then to the control, with the lower index. Robots choose one after the other, each among the locations that no earlier
     robot has chosen. A robot for which no costly location is left takes its first move.
 
@@ -107,13 +116,21 @@ class UrgencyRepair(TensorDictModuleBase):
         super().__init__()
         self.model = check_instance("model", model, RepairModel)
         self.exponent = check_number("exponent", exponent, "[0, inf)")
-        self._prices = tuple(model.costs.tolist())
+        # What a level costs more than an intact location.
+        self._prices = tuple((model.costs - model.costs[0]).tolist())
         # [L, L], target by origin.
         nearness = (model.graph.distances.T + 1.0) ** -self.exponent
         self.register_buffer("nearness", nearness.to(model.device, model.dtype), persistent=False)
         indices = torch.arange(model.num_locations, dtype=model.dtype, device=model.device).unsqueeze(-1)
         self.register_buffer("indices", indices, persistent=False)
-        self.register_buffer("first_moves", _first_moves(model), persistent=False)
+        self.register_buffer("first_moves", first_moves(model), persistent=False)
+
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+        """Compiled simulations, see :class:`~torchrl_pomdp.modules.scalar.ScalarEngine`."""
+        from torchrl_pomdp.modules.repair.scalar import engine, twins
+
+        data = self.nearness.double().numpy().T.copy(), float(model.costs[0]), max(self._prices)
+        return engine.repair_engine(twins.urgency, data, self.model, model, limits, numbers=self.model.num_robots)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``."""
@@ -143,7 +160,7 @@ def _columns(table: Tensor, location: Tensor) -> Tensor:
     return table.gather(1, location.expand(table.shape[0], -1))
 
 
-def _first_moves(model: RepairModel) -> Tensor:
+def first_moves(model: RepairModel) -> Tensor:
     """The lowest move of a robot at every location ``[L]``, or repair where it cannot move."""
     legal = model.destinations >= 0
     legal[:, REPAIR] = ~legal[:, 1:].any(-1)

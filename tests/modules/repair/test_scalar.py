@@ -1,0 +1,449 @@
+"""Compiled simulations of the repair problem mean what the tensors' way means."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import networkx as nx
+import numpy as np
+import pytest
+import torch
+from _oracles import Memo, line3_cost
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_pomdp.envs import FunctionPartition, SinglePart
+from torchrl_pomdp.envs.repair import CalibratedStart, Graph, RepairModel, RepairPartition, damage_chain, grid, line
+from torchrl_pomdp.modules import (
+    AfterSteps,
+    ConstantCost,
+    MultistepLookahead,
+    OnEntering,
+    OnLeaving,
+    ParallelRollout,
+    PartitionedPolicy,
+    PolicyCost,
+    PolicyNetwork,
+    RolloutPolicy,
+    TruncatedRollout,
+    ZeroCost,
+    rollout,
+)
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, SteadyStateCost, UrgencyRepair
+from torchrl_pomdp.modules.repair.scalar import expected_cost, repair_engine
+from torchrl_pomdp.noise import seed_keys
+from torchrl_pomdp.scalar import scalar_twin
+
+COSTS = (0, 0.1, 1, 10, 100)
+
+
+def without(make):
+    """What ``make`` makes, with the compiled loop taken out."""
+    made = make()
+    for part in made.modules():
+        if isinstance(part, TruncatedRollout):
+            part.scalar = None
+    return made
+
+
+def assert_close(compiled, tensors, share=0.001):
+    """To 1e-4, but for one number in a thousand, where rounding moves an observation."""
+    assert torch.equal(torch.isfinite(compiled), torch.isfinite(tensors))
+    finite = torch.isfinite(tensors)
+    error = ((compiled - tensors).abs() / tensors.abs().clamp_min(1e-6))[finite]
+    assert int((error > 1e-4).sum()) <= max(1, int(error.numel() * share))
+    assert float(error.median()) < 2e-6
+
+
+@st.composite
+def models(draw):
+    """Random graphs, chains, costs and numbers of robots."""
+    size, robots, levels = draw(st.integers(2, 6)), draw(st.integers(1, 2)), draw(st.integers(2, 5))
+    seed = draw(st.integers(0, 10_000))
+    tree = nx.random_labeled_tree(size, seed=seed)
+    generator = torch.Generator().manual_seed(seed)
+    if draw(st.booleans()):
+        chain = damage_chain(tuple(torch.rand(levels - 1, generator=generator).mul(0.3).tolist()))
+    else:
+        chain = torch.rand(levels, levels, generator=generator, dtype=torch.float64).square()
+        chain = chain / chain.sum(-1, keepdim=True)
+    if draw(st.booleans()):
+        chain[0] = torch.eye(levels, dtype=torch.float64)[0]
+    costs = torch.rand(levels, generator=generator).cumsum(0) * 10 - (0 if draw(st.booleans()) else 1)
+    graph = Graph.from_edges("tree", size, list(tree.edges))
+    model = RepairModel(graph, chain, costs.clamp_min(0), 0.9, num_robots=robots)
+    return model.with_partition(RepairPartition(graph, model.costs))
+
+
+def some_states(model, seed, count=40):
+    """Random beliefs, among them certain ones and intact locations."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = (count, model.num_locations, model.num_levels)
+    belief = torch.rand(shape, generator=generator).pow(3)
+    kind = torch.rand(shape[:2], generator=generator)
+    level = torch.randint(model.num_levels, shape[:2], generator=generator)
+    belief = torch.where((kind < 0.3).unsqueeze(-1), torch.eye(model.num_levels)[level], belief)
+    belief = torch.where((kind > 0.8).unsqueeze(-1), torch.eye(model.num_levels)[0], belief)
+    location = torch.randint(model.num_locations, (count, model.num_robots), generator=generator)
+    return TensorDict({"belief": belief / belief.sum(-1, keepdim=True), "location": location}, [count])
+
+
+RULES = {
+    "horizon": lambda model: {},
+    "steps": lambda model: {"max_steps": 7, "terminal_cost": NeverRepairCost(model)},
+    "rule": lambda model: {"truncation": AfterSteps(3), "terminal_cost": SteadyStateCost(model)},
+    "entering": lambda model: {"truncation": OnEntering((1, 3, 4, 5)), "terminal_cost": ConstantCost(model, 7.0)},
+    "leaving": lambda model: {"truncation": OnLeaving() | AfterSteps(12), "terminal_cost": ZeroCost()},
+    "own": lambda model: {
+        "truncation": AfterSteps(lambda y: 1 + y["location"][:, 0]) | OnLeaving(),
+        "terminal_cost": lambda y: y["belief"][..., -1].sum(-1) + y["partition"],
+    },
+}
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(models(), st.sampled_from(sorted(RULES)), st.sampled_from([GreedyRepair, UrgencyRepair]), st.integers(0, 1000))
+def test_trajectories_and_q_factors_are_those_of_the_tensors(model, rule, kind, seed):
+    base, y, options = kind(model), some_states(model, seed), RULES[rule](model)
+    # Where beliefs have mixed, locations at one distance are equally urgent but for rounding.
+    share = 0.1 if kind is UrgencyRepair and not bool((model.chain.tril(-1) == 0).all()) else 0.001
+    keys = seed_keys(seed, torch.arange(40))
+
+    def trajectories():
+        return TruncatedRollout(model, base, **options)
+
+    assert trajectories().scalar is not None
+    assert_close(trajectories()(y, keys), without(trajectories)(y, keys), share)
+    for leaves, count in (("control", 4), ("observation", 1)):
+
+        def policy(leaves=leaves, count=count):
+            return RolloutPolicy(model, base, trajectories=count, leaves=leaves, seed=seed, **options)
+
+        compiled, tensors = policy(), without(policy)
+        assert_close(compiled.q_factors(y), tensors.q_factors(y), share)
+        assert abs(compiled.simulated_steps / tensors.simulated_steps - 1) < 0.01
+
+
+@pytest.mark.parametrize("kind", [GreedyRepair, UrgencyRepair])
+@pytest.mark.parametrize("trajectories", [12, 40])
+def test_adaptive_allocation_spends_the_same(linear20, kind, trajectories):
+    model, y = linear20.model, linear20.start(torch.arange(60))
+    options = {"trajectories": trajectories, "allocation": "adaptive"}
+    compiled = RolloutPolicy(model, kind(model), **options)
+    tensors = without(lambda: RolloutPolicy(model, kind(model), **options))
+    assert_close(compiled.q_factors(y), tensors.q_factors(y))
+    assert abs(compiled.simulated_steps / tensors.simulated_steps - 1) < 0.02
+
+
+def test_whatever_is_made_of_rollouts_agrees(linear20):
+    model, y = linear20.model, linear20.start(torch.arange(6))
+    greedy, urgency = GreedyRepair(model), UrgencyRepair(model)
+    for make in (
+        lambda: MultistepLookahead(RolloutPolicy(model, urgency, trajectories=3), depth=2),
+        lambda: ParallelRollout([RolloutPolicy(model, base, trajectories=5) for base in (greedy, urgency)]),
+    ):
+        assert_close(make().q_factors(y), without(make).q_factors(y))
+
+    def cost():
+        return PolicyCost(
+            model, urgency, trajectories=3, truncation=OnEntering((3, 4, 5)), terminal_cost=NeverRepairCost(model)
+        )
+
+    assert_close(cost().costs(y), without(cost).costs(y))
+
+
+def test_double_precision_agrees(linear20):
+    model = RepairModel(grid(3, 3), damage_chain((0.001, 0.02, 0.03, 0.05)), COSTS, 0.99, dtype=torch.float64)
+    y, keys = CalibratedStart(model)(torch.arange(50)), torch.arange(50)
+
+    def make():
+        return TruncatedRollout(model, GreedyRepair(model))
+
+    torch.testing.assert_close(make()(y, keys), without(make)(y, keys), rtol=1e-12, atol=0)
+    q, own = RolloutPolicy(model, GreedyRepair(model)).q_factors(y), without(lambda: RolloutPolicy(model, GreedyRepair(model)))
+    assert q.dtype == torch.float64
+    torch.testing.assert_close(q, own.q_factors(y), rtol=1e-12, atol=0)
+
+
+# ---- closed forms --------------------------------------------------------------------------------------------------------
+
+
+@scalar_twin
+def wander(data, view, controls):
+    for robot in range(len(controls)):
+        controls[robot] = view.tables.first_moves[view.location[robot]]
+
+
+class Wanderer(TensorDictModuleBase):
+    """Goes back and forth, and never repairs."""
+
+    in_keys, out_keys = ["belief", "location"], ["action"]
+
+    def __init__(self, model):
+        super().__init__()
+        self.model, self.moves = model, GreedyRepair(model).first_moves
+
+    def scalar_engine(self, model, limits):
+        return repair_engine(wander, (0,), self.model, model, limits)
+
+    def forward(self, y):
+        return y.set("action", self.model.join_controls(self.moves[y["location"]]))
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.01])
+def test_never_repairing_costs_what_the_closed_form_says(drift):
+    """Whatever is seen on the way: on average, and to the last digit where beliefs are certain and damage is."""
+    model = RepairModel(line(5), damage_chain((drift, 0.02, 0.03, 0.05)), COSTS, 0.99, dtype=torch.float64)
+    y = CalibratedStart(model)(torch.zeros(20_000, dtype=torch.int64))
+    cost = TruncatedRollout(model, Wanderer(model), terminal_cost=NeverRepairCost(model))
+    assert cost.scalar is not None
+    costs = cost(y, torch.arange(20_000))
+    exact = NeverRepairCost(model).costs(y)
+    assert float((costs.mean() - exact[0]).abs()) < 4 * float(costs.std()) / 20_000**0.5
+    certain = RepairModel(line(5), damage_chain((0.0, 1.0, 1.0, 1.0)), COSTS, 0.99, dtype=torch.float64)
+    y = some_states(certain, 3).double()
+    y["location"] = y["location"].long()
+    level = torch.randint(5, (40, 5), generator=torch.Generator().manual_seed(1))
+    y["belief"] = torch.eye(5, dtype=torch.float64)[level]
+    costs = TruncatedRollout(certain, Wanderer(certain), terminal_cost=NeverRepairCost(certain))(y, torch.arange(40))
+    torch.testing.assert_close(costs, NeverRepairCost(certain).costs(y), rtol=1e-12, atol=0)
+
+
+def test_greedy_on_the_line_of_3_by_enumeration(line3):
+    model = line3.model
+    exact, _ = line3_cost(model, Memo(model, GreedyRepair(model)))
+    cost = TruncatedRollout(model, GreedyRepair(model))
+    assert cost.scalar is not None
+    costs = cost(line3.start(torch.arange(100_000)), torch.arange(100_000))
+    assert abs(float(costs.mean()) - exact) < 4 * float(costs.std()) / 100_000**0.5
+
+
+# ---- networks ------------------------------------------------------------------------------------------------------------
+
+
+def networks(model, others=(), hidden=(24, 12)):
+    encoder, generator = RelativeEncoder(model), torch.Generator().manual_seed(1)
+    made = [PolicyNetwork(encoder, model.num_controls, hidden, generator=generator) for _ in range(6)]
+    return PartitionedPolicy([others.get(part, made[part]) for part in range(6)] if others else made)
+
+
+@pytest.mark.parametrize("robots", [1, 2])
+@pytest.mark.parametrize("mixed", [False, True])
+def test_networks_choose_as_in_batches(robots, mixed):
+    graph = grid(3, 3)
+    model = RepairModel(graph, damage_chain((0.0, 0.02, 0.03, 0.05)), COSTS, 0.99, num_robots=robots)
+    model = model.with_partition(RepairPartition(graph, model.costs))
+    urgency = UrgencyRepair(model)
+    policy, y = networks(model, {3: urgency, 4: urgency} if mixed else ()), CalibratedStart(model)(torch.arange(20))
+
+    def make():
+        return RolloutPolicy(model, policy, trajectories=2, max_steps=60, terminal_cost=NeverRepairCost(model))
+
+    compiled = make()
+    assert compiled.cost_to_go.scalar is not None
+    assert_close(compiled.q_factors(y), without(make).q_factors(y))
+
+
+def test_networks_that_are_trained_further_are_read_again(linear20):
+    model = linear20.model
+    policy = networks(model)
+    cost, y, keys = TruncatedRollout(model, policy), linear20.start(torch.arange(20)), torch.arange(20)
+    before = cost(y, keys)
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.mul_(-1.0)
+    after = cost(y, keys)
+    assert not torch.equal(before, after)
+    assert_close(after, without(lambda: TruncatedRollout(model, policy))(y, keys))
+
+
+def test_what_the_loop_does_not_know_is_left_to_tensors(linear20):
+    model = linear20.model
+
+    class Other(AfterSteps):
+        pass
+
+    own = model.with_partition(FunctionPartition(["even", "odd"], lambda y: y["location"][..., 0] % 2))
+    single = PolicyNetwork(RelativeEncoder(model), 3, (8,), generator=torch.Generator().manual_seed(0))
+    greedy = GreedyRepair(model)
+    zero = {"terminal_cost": ZeroCost()}
+    for rollout_of in (
+        lambda: TruncatedRollout(model, greedy, truncation=Other(3), **zero),
+        lambda: TruncatedRollout(own, greedy, truncation=OnLeaving(), **zero),
+        lambda: TruncatedRollout(model, PartitionedPolicy([greedy, UrgencyRepair(model)] * 3)),
+        lambda: TruncatedRollout(own, networks(model)),
+        lambda: TruncatedRollout(model, greedy, max_steps=1_000_000, **zero),
+        lambda: TruncatedRollout(RepairModel(line(20), damage_chain((0.0, 0.1, 0.1, 0.1)), (0, 1, 1, 1, 1), 0.9), greedy),
+        lambda: TruncatedRollout(model, lambda y: greedy(y)),
+    ):
+        assert rollout_of().scalar is None
+    assert TruncatedRollout(own, greedy).scalar is not None
+    assert TruncatedRollout(model.with_partition(SinglePart()), greedy, truncation=OnEntering((0,)), **zero).scalar is not None
+    assert TruncatedRollout(model, single).scalar is not None
+
+
+def test_without_numba_tensors_do_all(linear20, monkeypatch):
+    model, y = linear20.model, linear20.start(torch.arange(3))
+    compiled = RolloutPolicy(model, GreedyRepair(model)).q_factors(y)
+    monkeypatch.setattr("torchrl_pomdp.modules.scalar.find_spec", lambda name: None)
+    policy = RolloutPolicy(model, GreedyRepair(model))
+    assert policy.cost_to_go.scalar is None
+    assert_close(compiled, policy.q_factors(y))
+
+
+# ---- a twin of one's own -------------------------------------------------------------------------------------------------
+
+
+@scalar_twin
+def costliest(data, view, controls):
+    """Go to the location that costs most now."""
+    for robot in range(len(controls)):
+        best, target = 0.0, view.location[robot]
+        for place in range(len(view.level)):
+            cost = expected_cost(view, place)
+            if cost > best * data[0]:
+                best, target = cost, place
+        origin = view.location[robot]
+        controls[robot] = view.tables.first_controls[origin, target] if best > 0.0 else view.tables.first_moves[origin]
+
+
+@scalar_twin
+def stubborn(data, view, controls):
+    controls[:] = data[0]
+
+
+class Twinned(TensorDictModuleBase):
+    in_keys, out_keys = ["belief", "location"], ["action"]
+
+    def __init__(self, model, twin, data):
+        super().__init__()
+        self.model, self.twin, self.data = model, twin, data
+
+    def scalar_engine(self, model, limits):
+        return repair_engine(self.twin, self.data, self.model, model, limits)
+
+    def forward(self, y):
+        costs = y["belief"] @ self.model.costs
+        target = costs.argmax(-1)
+        origin = y["location"][..., 0]
+        control = self.model.first_controls[origin, target]
+        return y.set("action", torch.where(costs.amax(-1) > 0, control, GreedyRepair(self.model).first_moves[origin]))
+
+
+def test_a_twin_of_ones_own(linear20):
+    model, y = linear20.model, linear20.start(torch.arange(50))
+
+    def make():
+        return RolloutPolicy(model, Twinned(model, costliest, (1.0,)), trajectories=3)
+
+    assert_close(make().q_factors(y), without(make).q_factors(y))
+
+
+@pytest.mark.parametrize("control", [-1, 0, 1, 3])
+def test_an_illegal_control_of_a_twin_is_refused(linear20, control):
+    model, y = linear20.model, linear20.start(torch.arange(50))
+    y["location"][:] = 0
+    y["belief"][:, 0] = torch.eye(5)[0]
+    policy = Twinned(model, stubborn, (control,))
+    with pytest.raises(ValueError, match="base_policy chose an illegal control in a simulated trajectory"):
+        TruncatedRollout(model, policy)(y, torch.arange(50))
+    with pytest.raises(ValueError, match="base_policy chose an illegal control in a simulated trajectory"):
+        RolloutPolicy(model, policy).q_factors(y)
+
+
+def test_states_are_checked_as_ever(linear20):
+    model, y = linear20.model, linear20.start(torch.arange(4))
+    policy = RolloutPolicy(model, GreedyRepair(model))
+    for change, kind, message in [
+        (lambda y: y["belief"].mul_(0.5), ValueError, "entry 'belief' of y"),
+        (lambda y: y["belief"][0].fill_(torch.nan), ValueError, "entry 'belief' of y"),
+        (lambda y: y["location"].fill_(20), ValueError, "entry 'location' of y"),
+        (lambda y: y.set("belief", y["belief"].double()), TypeError, "entry 'belief' of y has dtype"),
+        (lambda y: y.pop("location"), ValueError, "y lacks the entry 'location'"),
+    ]:
+        wrong = y.clone()
+        change(wrong)
+        with pytest.raises(kind, match=message):
+            policy.q_factors(wrong)
+    with pytest.raises(TypeError, match="y must be a TensorDict"):
+        policy.q_factors({"belief": 1})
+    assert policy.q_factors(y[:0]).shape == (0, 3)
+    assert policy.q_factors(y.reshape(2, 2)).shape == (2, 2, 3)
+    assert policy.q_factors(y[0]).shape == (3,)
+
+
+# ---- what does not change anything ---------------------------------------------------------------------------------------
+
+
+def test_labels_depend_on_the_state_alone(linear20):
+    model, y = linear20.model, linear20.start(torch.arange(90))
+    for options in ({}, {"allocation": "adaptive", "trajectories": 30}, {"leaves": "observation", "trajectories": 2}):
+        policy = RolloutPolicy(model, UrgencyRepair(model), **options)
+        whole, order = policy.q_factors(y), torch.randperm(90, generator=torch.Generator().manual_seed(0))
+        assert torch.equal(torch.cat([policy.q_factors(part) for part in y.split(7)]), whole)
+        assert torch.equal(policy.q_factors(y[order]), whole[order])
+        threads = torch.get_num_threads()
+        try:
+            torch.set_num_threads(3)
+            assert torch.equal(policy.q_factors(y), whole)
+        finally:
+            torch.set_num_threads(threads)
+
+
+def test_copies_have_a_loop_of_their_own(linear20):
+    policy = RolloutPolicy(linear20.model, GreedyRepair(linear20.model))
+    y = linear20.start(torch.arange(5))
+    for other in (copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
+        assert other.cost_to_go.scalar is not None
+        assert other.cost_to_go.scalar is not policy.cost_to_go.scalar
+        assert torch.equal(other.q_factors(y), policy.q_factors(y))
+
+
+# ---- a time for each decision --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("allocation", ["uniform", "adaptive"])
+def test_enough_time_is_as_good_as_no_limit(linear20, monkeypatch, compiled, allocation):
+    if not compiled:
+        monkeypatch.setattr(rollout, "scalar_engine", lambda *_: None)
+    model, y = linear20.model, linear20.start(torch.arange(5))
+    greedy, options = GreedyRepair(model), {"trajectories": 40, "allocation": allocation}
+    limited, free = RolloutPolicy(model, greedy, seconds=1000.0, **options), RolloutPolicy(model, greedy, **options)
+    torch.testing.assert_close(limited.q_factors(y), free.q_factors(y), rtol=1e-5, atol=0)
+    assert limited.simulated_steps == free.simulated_steps
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_no_time_is_enough_for_the_first_round(linear20, monkeypatch, compiled):
+    if not compiled:
+        monkeypatch.setattr(rollout, "scalar_engine", lambda *_: None)
+    model, y = linear20.model, linear20.start(torch.arange(5))
+    policy = RolloutPolicy(model, GreedyRepair(model), trajectories=1000, seconds=1e-9)
+    mask = model.action_mask(y)
+    assert torch.equal(torch.isfinite(policy.q_factors(y)), mask)
+    whole = RolloutPolicy(model, GreedyRepair(model), trajectories=1000)
+    whole.q_factors(y)
+    assert policy.simulated_steps < 0.01 * whole.simulated_steps
+    for depth in (2, 3):
+        q = MultistepLookahead(policy, depth=depth).q_factors(y)
+        assert torch.equal(torch.isfinite(q), mask)
+
+
+def test_seconds_must_be_positive(linear20):
+    for seconds in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="seconds must be in"):
+            RolloutPolicy(linear20.model, GreedyRepair(linear20.model), seconds=seconds)
+
+
+def test_as_many_trajectories_as_the_time_allows():
+    from torchrl_pomdp.modules.scalar import Allocation
+
+    allocation = Allocation(np.arange(100), np.full(25, 4), False, np.inf, 1e-12)
+    assert [rounds.tolist() for rounds in allocation.stretches()] == [[4]]
+    plenty = list(allocation._replace(seconds=1e6).stretches())
+    assert np.concatenate(plenty).tolist() == [4] * 25
+    assert len(plenty) < 8

@@ -1,0 +1,254 @@
+"""Compiled simulations of the repair problem, for policies with a scalar twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_pomdp.checks import check_instance
+from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.partition import SinglePart
+from torchrl_pomdp.envs.repair.model import RepairModel
+from torchrl_pomdp.envs.repair.partition import RepairPartition
+from torchrl_pomdp.modules.lookahead import check_q_factors
+from torchrl_pomdp.modules.repair.scalar.decisions import Decisions, decide
+from torchrl_pomdp.modules.repair.scalar.states import fingerprints, valid
+from torchrl_pomdp.modules.repair.scalar.tables import make_tables
+from torchrl_pomdp.modules.repair.scalar.trajectories import Limits, Trajectories, Work, simulate
+from torchrl_pomdp.modules.repair.terminal_costs import NeverRepairCost, SteadyStateCost
+from torchrl_pomdp.modules.scalar import Allocation, Cut, Limited, ScalarEngine
+from torchrl_pomdp.modules.scenarios import Scenarios
+from torchrl_pomdp.modules.terminal_costs import ConstantCost, ZeroCost
+from torchrl_pomdp.modules.threads import map_threads
+from torchrl_pomdp.modules.truncation import AfterSteps, OnEntering, OnLeaving, Truncation
+from torchrl_pomdp.scalar.compiling import entry
+from torchrl_pomdp.scalar.twins import ScalarTwin
+from torchrl_pomdp.tensor_checks import SUM_TOLERANCE
+
+__all__ = ["RepairEngine", "repair_engine"]
+
+# Largest tables, in numbers; beyond, the tensors' way is taken.
+_MOST_NUMBERS = 1 << 22
+_NEVER = 1 << 60
+
+
+def repair_engine(
+    twin: ScalarTwin,
+    data: tuple[Any, ...],
+    own: RepairModel,
+    model: BeliefModel,
+    limits: Limited,
+    numbers: int = 1,
+    refresh: Callable[[], None] | None = None,
+) -> RepairEngine | None:
+    """The engine for a policy with a twin; None where the kernel does not know what is asked for.
+
+    Args:
+        twin: the policy.
+        data: what the twin reads.
+        own: the policy's model.
+        model: the model that is simulated; its graph and costs must be the policy's.
+        limits: when trajectories end.
+        numbers: how many numbers of its own, ``view.work``, the twin needs.
+        refresh: called before every simulation, to bring the data up to date.
+    """
+    if not isinstance(model, RepairModel) or own.graph is not model.graph or not torch.equal(own.costs, model.costs):
+        return None
+    rules = () if limits.truncation is None else limits.truncation.rules
+    known = all(type(rule) in (AfterSteps, OnEntering, OnLeaving) for rule in rules)
+    parted = all(isinstance(rule, AfterSteps) for rule in rules) or type(model.partition) in (RepairPartition, SinglePart)
+    small = (limits.max_steps + 2) * model.num_levels**2 <= _MOST_NUMBERS and model.num_locations**2 <= _MOST_NUMBERS
+    if not (known and parted and small):
+        return None
+    return RepairEngine((twin, data), model, limits, rules, numbers, refresh)
+
+
+class RepairEngine(ScalarEngine):
+    """Simulates trajectories one at a time, on as many threads as there are for PyTorch.
+
+    Attributes:
+        closed: whether a cut's terminal cost is known in closed form.
+    """
+
+    def __init__(
+        self,
+        policy: tuple[ScalarTwin, tuple[Any, ...]],
+        model: RepairModel,
+        limits: Limited,
+        rules: Sequence[Truncation],
+        numbers: int,
+        refresh: Callable[[], None] | None,
+    ) -> None:
+        self.policy, self.model, self.numbers, self._refresh = policy, model, numbers, refresh
+        self._entries: dict[Any, Any] = {}
+        self._spare: list[Work] = []
+        self.tables = make_tables(model, limits.max_steps + 2)
+        after = [rule.m for rule in rules if isinstance(rule, AfterSteps)]
+        self._varying = [m for m in after if not isinstance(m, int)]
+        entering = {part for rule in rules if isinstance(rule, OnEntering) for part in rule.parts}
+        # There is but one part to enter.
+        at_once = [0] if entering and not isinstance(model.partition, RepairPartition) else []
+        closed = _closed_form(model, limits.terminal_cost)
+        self.closed = closed is not None and not self._varying
+        constant, level_costs = closed or (0.0, np.zeros(model.num_levels))
+        self.limits = Limits(
+            max_steps=min([limits.max_steps, *at_once, *(m for m in after if isinstance(m, int))]),
+            entering=sum(1 << part for part in entering),
+            leaving=any(isinstance(rule, OnLeaving) for rule in rules),
+            parts=model.partition.num_parts if isinstance(model.partition, RepairPartition) else 1,
+            closed=closed is not None,
+            constant=constant,
+            level_costs=level_costs,
+        )
+
+    # ---- trajectories ------------------------------------------------------------------------------------------------
+
+    def simulate(self, y: TensorDictBase, scenarios: Scenarios, count: int) -> tuple[Tensor, int, Cut | None]:
+        """See :class:`ScalarEngine`."""
+        self._bring_up_to_date()
+        beliefs, locations = self._arrays(y)
+        after = np.full(len(beliefs), _NEVER)
+        for m in self._varying:
+            after = np.minimum(after, AfterSteps(m).start(self.model.derive(y))[:, 0].numpy())
+        keys, groups, members, seen = (np.ascontiguousarray(numbers.numpy()) for numbers in scenarios)
+        every = Trajectories(
+            beliefs, locations, keys.view(np.uint64), groups.view(np.uint64), members, seen.view(np.uint64), after,
+            np.empty(len(beliefs)), np.empty(len(beliefs), np.int64),
+        )  # fmt: skip
+
+        def run(rows: slice) -> int:
+            steps, wrong = self._call_with_memory(simulate, Trajectories._make(numbers[rows] for numbers in every), count)
+            if wrong >= 0:
+                self._refuse()
+            return int(steps)
+
+        steps = sum(self._threads(run, len(beliefs)))
+        left = (every.cut >= 0).nonzero()[0]
+        return torch.from_numpy(every.total), steps, self._cut(left, every) if len(left) else None
+
+    def _cut(self, rows: NDArray[np.int64], every: Trajectories) -> Cut:
+        belief, location, ages = (torch.from_numpy(values[rows]) for values in (every.beliefs, every.locations, every.cut))
+        y = TensorDict({"belief": belief.to(self.model.dtype), "location": location}, batch_size=[len(rows)])
+        return Cut(torch.from_numpy(rows), ages, y)
+
+    # ---- decisions ---------------------------------------------------------------------------------------------------
+
+    def q_factors(self, y: TensorDictBase, keys: Tensor | None, seed: int, allocation: Allocation) -> tuple[NDArray[Any], int]:
+        """See :class:`ScalarEngine`."""
+        self._bring_up_to_date()
+        belief, location = self._checked(y)
+        beliefs = belief.astype(np.float64, order="C")
+        if not self._call(valid, beliefs, location, SUM_TOLERANCE):
+            self.model.check_state(y)
+        streams = self._keys(belief, location, seed) if keys is None else np.ascontiguousarray(keys.numpy()).view(np.uint64)
+        shape = len(beliefs), self.model.num_controls
+        q = np.empty(shape, belief.dtype)
+
+        def run(rows: slice) -> int:
+            own, steps = q[rows], 0
+            costs, made = np.zeros((len(own), len(allocation.order), shape[1])), np.zeros(own.shape, np.int64)
+            states = Decisions(beliefs[rows], location[rows], streams[rows], costs, made, np.zeros(own.shape, np.bool_), own)
+            for rounds in allocation.stretches():
+                more, wrong, finite = self._call_with_memory(
+                    decide, states, allocation.order, rounds, allocation.observations, allocation.clearly
+                )
+                if wrong >= 0:
+                    self._refuse()
+                if not finite:
+                    check_q_factors(torch.from_numpy(own), self.model.action_mask(y).reshape(shape)[rows])
+                steps += more
+                if not states.rivals.any():
+                    break
+            return steps
+
+        return q, sum(self._threads(run, shape[0], 4096 if allocation.seconds is None else 1))
+
+    def _keys(self, belief: NDArray[Any], location: NDArray[np.int64], seed: int) -> NDArray[np.uint64]:
+        # Adding zero turns -0.0, which compares equal to 0.0, into 0.0.
+        flat = np.ascontiguousarray(belief).reshape(len(belief), self.model.num_locations * self.model.num_levels) + 0.0
+        bits = flat.view(np.int32 if belief.dtype == np.float32 else np.int64)
+        keys = np.empty(len(belief), np.uint64)
+        self._call(fingerprints, bits, location, np.uint64(seed % (1 << 64)), keys)
+        return keys
+
+    # ---- helpers -----------------------------------------------------------------------------------------------------
+
+    def _bring_up_to_date(self) -> None:
+        if self._refresh is not None:
+            self._refresh()
+
+    def _arrays(self, y: TensorDictBase) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Copies of beliefs ``[N, L, K]`` and locations ``[N, R]`` of checked states."""
+        return np.array(y.get("belief").numpy(), np.float64, order="C"), np.array(y.get("location").numpy(), order="C")
+
+    def _checked(self, y: TensorDictBase) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Beliefs ``[N, L, K]`` and locations ``[N, R]`` of states ``[*B]``; raises unless kind and shape are right."""
+        model = self.model
+        check_instance("y", y, TensorDictBase)
+        belief, location, shape = y.get("belief", None), y.get("location", None), y.batch_size
+        own = (model.num_locations, model.num_levels), (model.num_robots,)
+        for numbers, dtype, size in zip((belief, location), (model.dtype, torch.int64), own, strict=True):
+            if not isinstance(numbers, Tensor) or numbers.dtype != dtype or numbers.shape != (*shape, *size):
+                model.check_state(y)
+        return belief.numpy().reshape(-1, *own[0]), np.ascontiguousarray(location.numpy().reshape(-1, *own[1]))
+
+    def _call(self, function: Any, *args: Any) -> Any:
+        """Call a compiled loop. Arguments must have the same types and memory layouts at every call: nothing checks them."""
+        if function not in self._entries:
+            self._entries[function] = entry(function, *args)
+        return self._entries[function](*args)
+
+    def _call_with_memory(self, function: Any, *args: Any) -> Any:
+        """Call a compiled loop that simulates, with memory of its own for its time."""
+        work = self._spare.pop() if self._spare else self._work()
+        try:
+            return self._call(function, self.policy, self.tables, self.limits, work, *args)
+        finally:
+            self._spare.append(work)
+
+    def _work(self) -> Work:
+        model = self.model
+        size, robots = model.num_locations, model.num_robots
+        return Work(
+            location=np.empty(robots, np.int64),
+            initial=np.empty(size, np.int64),
+            level=np.empty(size, np.int64),
+            since=np.empty(size, np.int64),
+            intact=np.empty(size, np.float32),
+            controls=np.empty(robots, np.int64),
+            seen=np.empty(robots, np.int64),
+            numbers=np.empty(self.numbers, np.float32),
+            row=np.empty(model.num_levels),
+            mask=np.empty(model.num_controls, np.bool_),
+        )
+
+    def _threads(self, run: Any, count: int, block: int = 4096) -> list[int]:
+        threads = torch.get_num_threads()
+        size = max(1, min(block, -(-count // threads)))
+        return map_threads(run, [slice(i, min(i + size, count)) for i in range(0, count, size)], threads)
+
+    def _refuse(self) -> None:
+        raise ValueError(
+            "base_policy chose an illegal control in a simulated trajectory; its scalar twin must choose among the controls "
+            "that are legal where the robots are"
+        )
+
+
+def _closed_form(model: RepairModel, terminal_cost: Any) -> tuple[float, NDArray[np.float64]] | None:
+    """A terminal cost as a constant and a cost for the level of each location; None where it is none of these."""
+    kind, nothing = type(terminal_cost), np.zeros(model.num_levels)
+    if terminal_cost is None or kind is ZeroCost:
+        return 0.0, nothing
+    if kind is ConstantCost:
+        return terminal_cost.cost, nothing
+    if kind is NeverRepairCost:
+        return 0.0, np.array(terminal_cost.level_costs)
+    if kind is SteadyStateCost and terminal_cost.model is model:
+        return 0.0, model.costs.double().numpy() / (1.0 - model.discount)
+    return None

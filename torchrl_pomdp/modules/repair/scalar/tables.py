@@ -1,0 +1,49 @@
+"""The repair problem as tables, for compiled simulations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_pomdp.envs.repair.model import RepairModel
+from torchrl_pomdp.envs.repair.partition import RepairPartition
+from torchrl_pomdp.modules.repair.base_policies import first_moves
+from torchrl_pomdp.modules.repair.scalar.view import Tables
+
+__all__ = ["make_tables"]
+
+
+def make_tables(model: RepairModel, stages: int) -> Tables:
+    """What the kernel reads of a model, for so many stages."""
+    chain, costs = model.chain.double().numpy(), model.costs.double().numpy()
+    size, levels = model.num_locations, model.num_levels
+    powers = np.empty((stages, levels, levels))
+    powers[0] = np.eye(levels)
+    for n in range(1, stages):
+        powers[n] = powers[n - 1] @ chain
+    stage_costs, discounts = powers @ costs, np.power(model.discount, np.arange(stages), dtype=np.float64)
+    interval_costs = np.zeros((stages, levels))
+    interval_costs[1:] = np.cumsum(discounts[:-1, None] * stage_costs[:-1], 0)
+    distances = model.graph.distances.numpy()
+    absorbing = model.level_zero_absorbing
+    steady = absorbing and bool((chain[1:, 0] == 0).all())
+    own = model.partition if isinstance(model.partition, RepairPartition) else RepairPartition(model.graph, model.costs)
+    return Tables(
+        powers=powers,
+        cumulative=np.cumsum(powers, -1),
+        stage_costs=stage_costs,
+        interval_costs=interval_costs,
+        discounts=discounts,
+        destinations=model.destinations.numpy(),
+        order=np.argsort(distances * size + np.arange(size), 1),
+        first_controls=model.graph.first_controls.numpy(),
+        first_moves=first_moves(model).numpy(),
+        columns=own.columns.double().numpy(),
+        prices=np.array(own.prices),
+        absorbing=absorbing,
+        steady=steady,
+        free=steady and costs[0] == 0.0,
+        terminal_probability=model.terminal_probability,
+        damage_threshold=own.damage_threshold,
+        low=own.density_bounds[0],
+        high=own.density_bounds[1],
+    )

@@ -1,0 +1,149 @@
+"""Scalar twins of the repair problem's base policies and networks; see :class:`~torchrl_pomdp.modules.repair.scalar.View`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_pomdp.modules.repair.scalar.view import expected_cost, intact, legal, part_of, probability
+from torchrl_pomdp.scalar.compiling import inner, products
+from torchrl_pomdp.scalar.twins import choose, scalar_twin
+
+__all__ = ["greedy", "networks", "urgency"]
+
+
+@scalar_twin
+def greedy(data, view, controls):
+    """The nearest location that may be damaged; ``data`` is the threshold."""
+    tables, (threshold,) = view.tables, data
+    for robot in range(len(controls)):
+        origin = view.location[robot]
+        controls[robot] = tables.first_moves[origin]
+        for i in range(tables.order.shape[1]):
+            place = tables.order[origin, i]
+            if not intact(view, place, threshold):
+                controls[robot] = tables.first_controls[origin, place]
+                break
+
+
+@scalar_twin
+def urgency(data, view, controls):
+    """The location with the largest extra cost over a power of the distance.
+
+    ``data`` holds the inverse of these powers, the cost of an intact location, and the largest extra cost.
+    """
+    tables, (nearness, intact_cost, highest) = view.tables, data
+    targets = view.work
+    for robot in range(len(controls)):
+        origin = view.location[robot]
+        best, chosen = 0.0, -1
+        for i in range(tables.order.shape[1]):
+            place = tables.order[origin, i]
+            near = nearness[origin, place]
+            # What lies further away cannot be more urgent.
+            if highest * near < best:
+                break
+            if view.intact[place] == 1.0:
+                continue
+            taken = False
+            for other in range(robot):
+                taken = taken or targets[other] == place
+            urgent = 0.0 if taken else (expected_cost(view, place) - intact_cost) * near
+            if urgent > best or (urgent == best and 0 <= place < chosen):
+                best, chosen = urgent, place
+        targets[robot] = chosen
+        controls[robot] = tables.first_moves[origin] if chosen < 0 else tables.first_controls[origin, chosen]
+
+
+@inner
+def _features(view, columns, places, robot_features, work, size):
+    """Put what is not zero of the features into ``work``: where, then how much; returns how many there are."""
+    levels, count = view.start.shape[1], 0
+    for robot in range(len(view.location)):
+        origin, first = view.location[robot], robot * robot_features
+        for place in range(len(view.level)):
+            if view.intact[place] == 1.0:
+                continue
+            for k in range(levels):
+                value = 1.0 if k == 0 else probability(view, place, k)
+                if value > 0.0:
+                    work[count], work[size + count] = first + columns[origin, place * levels + k], value
+                    count += 1
+        work[count], work[size + count] = first + places[origin], 1.0
+        count += 1
+    return count
+
+
+@products
+def _affine(weights, bias, rows, factors, out):
+    """``out = bias + factors @ weights[rows]``, four rows at a time."""
+    i, count = 0, len(rows)
+    for j in range(len(out)):
+        out[j] = bias[j]
+    while i + 4 <= count:
+        a, b, c, d = (
+            weights[np.int64(rows[i])],
+            weights[np.int64(rows[i + 1])],
+            weights[np.int64(rows[i + 2])],
+            weights[np.int64(rows[i + 3])],
+        )
+        p, q, r, s = factors[i], factors[i + 1], factors[i + 2], factors[i + 3]
+        for j in range(len(out)):
+            out[j] += (p * a[j] + q * b[j]) + (r * c[j] + s * d[j])
+        i += 4
+    while i < count:
+        a, p = weights[np.int64(rows[i])], factors[i]
+        for j in range(len(out)):
+            out[j] += p * a[j]
+        i += 1
+
+
+@inner
+def _positive(work, size, width):
+    """The positive outputs of a layer become what is not zero of the next one's input."""
+    count = 0
+    for j in range(width):
+        value = work[2 * size + j]
+        if value > 0.0:
+            work[count], work[size + count] = j, value
+            count += 1
+    return count
+
+
+@inner
+def _best_control(view, work, at, width, controls):
+    """The legal joint control with the largest logit, ties to the lower."""
+    robots, base, best, highest = len(controls), view.tables.destinations.shape[1], -1, -np.inf
+    for u in range(width):
+        rest, fits = u, True
+        for robot in range(robots - 1, -1, -1):
+            fits = fits and legal(view, robot, rest % base)
+            rest //= base
+        if fits and work[at + u] > highest:
+            best, highest = u, work[at + u]
+    for robot in range(robots - 1, -1, -1):
+        controls[robot] = best % base
+        best //= base
+
+
+@scalar_twin
+def networks(data, view, controls):
+    """Policy networks on the features of :class:`~torchrl_pomdp.modules.repair.RelativeEncoder`, one for each part.
+
+    ``data`` holds the number of each part's network, or -1 for the base policy; which feature is what; for every layer the
+    weights ``[network, in, out]`` and biases; and the base policy. Features and outputs that are zero cost nothing.
+    """
+    numbers, columns, places, robot_features, weights, biases, base = data
+    own = numbers[part_of(view) if len(numbers) > 1 else 0]
+    if own < 0:
+        choose(base, view, controls)
+        return
+    # The memory of the twin: rows of the weights that are met, their factors, outputs of a layer.
+    work, size = view.work, len(view.work) // 3
+    count = _features(view, columns, places, robot_features, work, size)
+    last = len(weights) - 1
+    for layer in range(last + 1):
+        bias = biases[layer][own]
+        _affine(weights[layer][own], bias, work[:count], work[size : size + count], work[2 * size : 2 * size + len(bias)])
+        if layer < last:
+            count = _positive(work, size, weights[layer].shape[2])
+    _best_control(view, work, 2 * size, weights[last].shape[2], controls)

@@ -1,0 +1,159 @@
+"""What a compiled simulation of the repair problem shows: the model as tables, and the state of a trajectory.
+
+Between two looks at a location its belief evolves without noise. Its belief and its expected cost at any stage are thus read
+from a table, given when and at which level it was last seen.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_pomdp.scalar.compiling import inner
+
+__all__ = ["Tables", "View", "expected_cost", "intact", "legal", "part_of", "probability"]
+
+
+class Tables(NamedTuple):
+    r"""What simulations read of a model.
+
+    Attributes:
+        powers: :math:`P^n`, ``[n, K, K]``.
+        cumulative: the same, summed over the levels up to each, ``[n, K, K]``.
+        stage_costs: :math:`(P^nc)_k`, ``[n, K]``.
+        interval_costs: :math:`C_{nk}`, ``[n, K]``.
+        discounts: :math:`\alpha^n`, ``[n]``.
+        destinations: location after a robot's control, -1 where the move leaves the graph, ``[L, A]``.
+        order: all locations by their distance from one, then by number, ``[L, L]``.
+        first_controls: the control that starts a shortest path, ``[L, L]``.
+        first_moves: the lowest move at a location, or repair where there is none, ``[L]``.
+        columns: the partition's columns, ``[L]``.
+        prices: cost of every level, as the partition has them, ``[K]``.
+        absorbing: whether level 0 is, so that there are terminal states.
+        steady: whether, moreover, no other level leads to level 0.
+        free: whether, moreover, level 0 costs nothing.
+        terminal_probability: :math:`\epsilon`.
+        damage_threshold: of the partition.
+        low: density bound of the partition.
+        high: the other one.
+    """
+
+    powers: NDArray[np.float64]
+    cumulative: NDArray[np.float64]
+    stage_costs: NDArray[np.float64]
+    interval_costs: NDArray[np.float64]
+    discounts: NDArray[np.float64]
+    destinations: NDArray[np.int64]
+    order: NDArray[np.int64]
+    first_controls: NDArray[np.int64]
+    first_moves: NDArray[np.int64]
+    columns: NDArray[np.float64]
+    prices: NDArray[np.float64]
+    absorbing: bool
+    steady: bool
+    free: bool
+    terminal_probability: float
+    damage_threshold: float
+    low: float
+    high: float
+
+
+class View(NamedTuple):
+    """What a scalar twin sees of a simulated trajectory, see :func:`torchrl_pomdp.scalar.scalar_twin`.
+
+    Ask for beliefs by :func:`intact`, :func:`expected_cost` and :func:`probability`.
+
+    Attributes:
+        stage: stages since the trajectory started.
+        location: where the robots are, ``[R]``.
+        level: level of every location when it was last seen, -1 where it has not been, ``[L]``.
+        since: the stage of that, ``[L]``.
+        intact: probability now that a location is intact, ``[L]``.
+        start: belief in which the trajectory started, ``[L, K]``.
+        tables: the model.
+        work: numbers for the twin's own use, which it finds as it left them in the same trajectory or in another one.
+    """
+
+    stage: int
+    location: NDArray[np.int64]
+    level: NDArray[np.int64]
+    since: NDArray[np.int64]
+    intact: NDArray[np.float32]
+    start: NDArray[np.float64]
+    tables: Tables
+    work: NDArray[np.float32]
+
+
+@inner
+def probability(view, place, level):
+    """Probability now that a location is at a level."""
+    n, known = view.stage - view.since[place], view.level[place]
+    if known >= 0:
+        return view.tables.powers[n, known, level]
+    total = 0.0
+    for k in range(view.start.shape[1]):
+        total += view.start[place, k] * view.tables.powers[n, k, level]
+    return total
+
+
+@inner
+def expected_cost(view, place):
+    """Expected cost of a location at this stage."""
+    n, known = view.stage - view.since[place], view.level[place]
+    if known >= 0:
+        return view.tables.stage_costs[n, known]
+    total = 0.0
+    for k in range(view.start.shape[1]):
+        total += view.start[place, k] * view.tables.stage_costs[n, k]
+    return total
+
+
+@inner
+def intact(view, place, threshold):
+    """Whether a location is intact but for a probability up to ``threshold``, in single precision."""
+    return view.intact[place] + np.float32(threshold) >= np.float32(1.0)
+
+
+@inner
+def legal(view, robot, control):
+    """Whether a robot may take a control."""
+    tables, place = view.tables, view.location[robot]
+    if not 0 <= control < tables.destinations.shape[1]:
+        return False
+    if control > 0:
+        return tables.destinations[place, control] >= 0
+    if view.intact[place] < 1.0:
+        return True
+    return tables.first_moves[place] == 0
+
+
+@inner
+def part_of(view):
+    """Part of a state, see :class:`~torchrl_pomdp.envs.repair.RepairPartition`."""
+    tables, size, robots = view.tables, len(view.level), len(view.location)
+    num_intact, centre = 0, 0.0
+    for robot in range(robots):
+        centre += tables.columns[view.location[robot]]
+    left, right = 0.0, 0.0
+    for place in range(size):
+        if intact(view, place, tables.damage_threshold):
+            num_intact += 1
+        side = centre - tables.columns[place] * robots
+        if side >= 1.0 or side <= -1.0:
+            cost = 0.0
+            n, known = view.stage - view.since[place], view.level[place]
+            if known >= 0:
+                for k in range(view.start.shape[1]):
+                    cost += tables.powers[n, known, k] * tables.prices[k]
+            else:
+                for k in range(view.start.shape[1]):
+                    cost += probability(view, place, k) * tables.prices[k]
+            if side >= 1.0:
+                left += cost
+            else:
+                right += cost
+    total = left + right
+    density = 1 - int(left > tables.high * total) + int(left < tables.low * total)
+    return density + (3 if 2 * num_intact > size else 0)

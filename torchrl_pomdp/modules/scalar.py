@@ -1,0 +1,132 @@
+r"""What a compiled simulation is to the rollout: trajectories and Q-factors, one at a time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from importlib.util import find_spec
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.modules.scenarios import Scenarios
+from torchrl_pomdp.modules.truncation import Truncation
+
+__all__ = ["Allocation", "Cut", "Limited", "ScalarEngine", "scalar_engine"]
+
+
+class Cut(NamedTuple):
+    """Trajectories that were cut, and whose terminal cost is still to be added.
+
+    Attributes:
+        rows: their numbers, int64 ``[M]``.
+        ages: the steps that they made, int64 ``[M]``.
+        y: their feature states, core entries ``[M]``.
+    """
+
+    rows: Tensor
+    ages: Tensor
+    y: TensorDictBase
+
+
+class Allocation(NamedTuple):
+    """How the trajectories of a decision are spent.
+
+    Attributes:
+        order: numbers of the trajectories in the order in which they are made, ``[n]``.
+        rounds: how many of them every round makes.
+        observations: whether a leaf is an observation.
+        clearly: standard errors by which a control is beaten and gets no more; infinite: none ever is.
+        seconds: time for the decision; None: as long as it takes.
+    """
+
+    order: NDArray[np.int64]
+    rounds: NDArray[np.int64]
+    observations: bool
+    clearly: float
+    seconds: float | None
+
+    def stretches(self) -> Iterator[NDArray[np.int64]]:
+        """The rounds, as many at a time as the time allows; the first one always."""
+        if self.seconds is None:
+            yield self.rounds
+            return
+        begin, done, spent = perf_counter(), 0, 0
+        while done < len(self.rounds):
+            elapsed = perf_counter() - begin
+            # A trajectory of what is left costs no more than one so far, as beaten controls get none.
+            fitting = self.rounds[done] if spent == 0 else int(min(spent, spent * (self.seconds / elapsed - 1.0)))
+            last = done + int(np.searchsorted(np.cumsum(self.rounds[done:]), fitting, "right"))
+            if last == done:
+                return
+            yield self.rounds[done:last]
+            spent += int(self.rounds[done:last].sum())
+            done = last
+
+
+class Limited(NamedTuple):
+    """When the trajectories of a rollout end, see :class:`~torchrl_pomdp.modules.TruncatedRollout`."""
+
+    max_steps: int
+    truncation: Truncation | None
+    terminal_cost: Any
+
+
+class ScalarEngine(ABC):
+    """Simulates the trajectories of a policy with a scalar twin; means the same as the tensors' way.
+
+    Attributes:
+        closed: whether Q-factors can be computed in one go: all that a cut adds is known to the compiled loop.
+    """
+
+    closed: bool
+
+    @abstractmethod
+    def simulate(self, y: TensorDictBase, scenarios: Scenarios, count: int) -> tuple[Tensor, int, Cut | None]:
+        """Cost of one trajectory from each of the states ``y`` ``[N]``.
+
+        Args:
+            y: feature states, checked.
+            scenarios: their noise.
+            count: number of trajectories of an estimate.
+
+        Returns:
+            costs ``[N]``, steps, and the trajectories that still lack a terminal cost.
+        """
+
+    @abstractmethod
+    def q_factors(self, y: TensorDictBase, keys: Tensor | None, seed: int, allocation: Allocation) -> tuple[NDArray[Any], int]:
+        """Q-factors ``[N, U]`` of states of batch ``[*B]``, infinite where a control is illegal, and the number of steps.
+
+        Args:
+            y: feature states.
+            keys: keys of their scenarios, ``[N]``; None: as ``RolloutPolicy.keys`` gives them.
+            seed: seed of these.
+            allocation: how trajectories are spent.
+
+        Raises:
+            TypeError: by ``BeliefModel.check_state``.
+            ValueError: likewise, or if the policy's twin chooses an illegal control.
+        """
+
+
+def scalar_engine(policy: Any, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+    """Compiled simulations of a policy; None where policy or model offer none, on an accelerator, or without numba.
+
+    A policy offers them by a method ``scalar_engine(model, limits)``.
+
+    Args:
+        policy: the policy.
+        model: the belief model.
+        limits: when trajectories end.
+    """
+    make = getattr(policy, "scalar_engine", None)
+    if make is None or model.device.type != "cpu" or find_spec("numba") is None:
+        return None
+    engine: ScalarEngine | None = make(model, limits)
+    return engine

@@ -1,0 +1,99 @@
+"""Compiled functions for fixed types of arguments: kept on disk, called without delay."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable
+from threading import Timer
+from types import CodeType, FunctionType
+from typing import Any
+
+from numba import njit, typeof
+from numba.core.dispatcher import Dispatcher
+
+__all__ = ["OPTIONS", "code_digest", "entry", "inner", "outer", "products"]
+
+_LOG = logging.getLogger(__name__)
+# A compilation that takes longer, in seconds, is announced.
+_SOON = 1.0
+
+# Without reference counts: they cost more than the simulation, and nothing is allocated in a loop.
+_BARE: dict[str, Any] = {"_nrt": False}
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "forceinline": True, **_BARE}
+"""Options of a part of a loop."""
+
+
+def inner(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a part of a loop, which becomes part of the code that calls it."""
+    compiled: Callable[..., Any] = njit(**OPTIONS)(function)
+    return compiled
+
+
+def outer(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a loop, which other threads run beside.
+
+    It is kept on disk by its name, which a digest of the code in it makes another one when that changes.
+    """
+    function.__qualname__ += f"_{code_digest(function)}"
+    compiled: Callable[..., Any] = njit(error_model="numpy", cache=True, nogil=True, **_BARE)(function)
+    return compiled
+
+
+def products(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile sums of products, which may be rounded once instead of twice."""
+    compiled: Callable[..., Any] = njit(error_model="numpy", fastmath={"contract"}, **_BARE)(function)
+    return compiled
+
+
+def entry(function: Any, *args: Any) -> Callable[..., Any]:
+    """A compiled loop for arguments of the types of ``args`` alone, compiled now or read from disk.
+
+    Looking at the types of dozens of arguments takes longer than a decision; what is returned does not.
+
+    Args:
+        function: a loop made by :func:`outer`.
+        args: examples of its arguments.
+    """
+    timer = Timer(_SOON, _LOG.warning, ["compiling simulations, once: up to 20 seconds"])
+    timer.daemon = True
+    timer.start()
+    try:
+        compiled: Callable[..., Any] = function.compile(tuple(map(typeof, args)))
+    finally:
+        timer.cancel()
+    return compiled
+
+
+def code_digest(function: Any) -> str:
+    """Digest of a function's code, and of that of the compiled functions, records and numbers that it reads."""
+    seen: dict[str, bytes] = {}
+    _collect(function, seen)
+    content = b"".join(name.encode() + code for name, code in sorted(seen.items()))
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _collect(value: Any, seen: dict[str, bytes]) -> None:
+    function = value.py_func if isinstance(value, Dispatcher) else value
+    if not isinstance(function, FunctionType):
+        return
+    name = f"{function.__module__}.{function.__qualname__}"
+    if name in seen:
+        return
+    seen[name] = _code(function.__code__)
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    for read, found in [
+        *((key, function.__globals__.get(key)) for key in function.__code__.co_names),
+        *zip(function.__code__.co_freevars, cells, strict=True),
+    ]:
+        if isinstance(found, Dispatcher):
+            _collect(found, seen)
+        elif hasattr(found, "_fields"):
+            seen[f"{name}:{read}"] = repr(found._fields).encode()
+        elif isinstance(found, (int, float, str, bool)) or hasattr(found, "dtype"):
+            seen[f"{name}:{read}"] = repr(found).encode()
+
+
+def _code(code: CodeType) -> bytes:
+    constants = [each for each in code.co_consts if not isinstance(each, CodeType)]
+    return code.co_code + repr((constants, code.co_names)).encode()
