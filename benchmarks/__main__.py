@@ -13,9 +13,9 @@ FOLDER = Path(__file__).parent
 BENCHMARKS = {
     function.__name__: function
     for function in (
-        engine.greedy, engine.batch, engine.network, engine.router, engine.locations, engine.memory, engine.env_step,
-        tabular.updates, decisions.decision, decisions.labels, decisions.adaptive, decisions.expectation, where.profile,
-        rocksample.rocksample_updates, rocksample.rocksample_rewards,
+        engine.trajectories, engine.looks, engine.batch, engine.network, engine.router, engine.locations, engine.memory,
+        engine.env_step, tabular.updates, decisions.decision, decisions.labels, decisions.adaptive, decisions.expectation,
+        where.profile, rocksample.rocksample_updates, rocksample.rocksample_rewards,
     )
 }  # fmt: skip
 

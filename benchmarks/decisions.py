@@ -8,28 +8,38 @@ import time
 import torch
 
 from benchmarks.harness import Table, threads
-from benchmarks.setting import Counting, linear20, networks, states
-from torchrl_pomdp.modules import RolloutPolicy, TruncatedRollout
-from torchrl_pomdp.modules.repair import GreedyRepair
+from benchmarks.setting import by_tensors, linear20, networks, states
+from torchrl_pomdp.modules import MultistepLookahead, RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 
 
 def decision(table: Table) -> None:
-    """One decision for one start state, 10 trajectories for each control."""
+    """One decision for one start state, on one core."""
     problem = linear20()
-    greedy = GreedyRepair(problem.model)
-    for name, base, compile, target in (
-        ("greedy base", greedy, False, "<= 25"),
-        ("greedy base, compiled", greedy, True, "<= 25"),
-        ("network base", networks(), False, ""),
+    greedy, urgency, network = GreedyRepair(problem.model), UrgencyRepair(problem.model), networks()
+    ten = {"trajectories": 10}
+    many = {"trajectories": 4096, "allocation": "adaptive"}
+    for name, policy, target in (
+        ("greedy base, 10 trajectories", RolloutPolicy(problem.model, greedy, **ten), "<= 0.2"),
+        ("urgency base, 10 trajectories", RolloutPolicy(problem.model, urgency, **ten), "<= 0.4"),
+        ("network base, 10 trajectories", RolloutPolicy(problem.model, network, **ten), "<= 15"),
+        ("network base, 5 trajectories", RolloutPolicy(problem.model, network, trajectories=5), "<= 8"),
+        ("greedy base, 10 trajectories, tensors", by_tensors(RolloutPolicy(problem.model, greedy, **ten)), ""),
+        ("urgency base, 10 trajectories, tensors", by_tensors(RolloutPolicy(problem.model, urgency, **ten)), ""),
+        ("network base, 10 trajectories, tensors", by_tensors(RolloutPolicy(problem.model, network, **ten)), ""),
+        ("two steps, urgency base", MultistepLookahead(RolloutPolicy(problem.model, urgency, **ten), 2), ""),
+        ("three steps, urgency base", MultistepLookahead(RolloutPolicy(problem.model, urgency, **ten), 3), ""),
+        ("urgency base, 1 ms", RolloutPolicy(problem.model, urgency, seconds=0.001, **many), ""),
+        ("urgency base, 10 ms", RolloutPolicy(problem.model, urgency, seconds=0.01, **many), ""),
     ):
-        policy = RolloutPolicy(problem.model, base, trajectories=10, compile=compile)
         times = []
-        # The first ones compile.
-        for i in range(-5, 41):
-            y = problem.model.with_features(problem.start(torch.tensor([i % 41])))
-            begin = time.perf_counter()
-            policy(y)
-            times.append(time.perf_counter() - begin)
+        with threads(1):
+            # The first ones compile.
+            for i in range(-5, 101):
+                y = problem.start(torch.tensor([i % 101]))
+                begin = time.perf_counter()
+                policy(y)
+                times.append(time.perf_counter() - begin)
         table.add(f"one decision, {name}, median", 1e3 * statistics.median(times[5:]), "ms", target)
 
 
@@ -37,20 +47,23 @@ def labels(table: Table) -> None:
     """Labelled training states per second on all cores; hours for 1.2 million states."""
     problem = linear20()
     cases = [
-        ("greedy", GreedyRepair(problem.model), "control", 20_400, ""),
+        ("greedy", GreedyRepair(problem.model), "control", 20_400, ">= 15"),
         ("greedy", GreedyRepair(problem.model), "observation", 4_800, ""),
-        ("network", networks(), "control", 20_400, "<= 0.5"),
-        ("network", networks(), "observation", 3_000, ""),
+        ("urgency", UrgencyRepair(problem.model), "control", 20_400, ""),
+        ("network", networks(), "control", 6_000, ""),
     ]
     for name, base, leaves, count, target in cases:
-        y = states(count, seed=1)
-        policy = RolloutPolicy(problem.model, base, trajectories=10, leaves=leaves)
-        policy.q_factors(y[:600])
-        begin = time.perf_counter()
-        policy.q_factors(y)
-        rate = count / (time.perf_counter() - begin)
-        table.add(f"labels, {name} base, 10 trajectories per {leaves}, {count} states", rate, "states/s")
-        table.add(f"labels, {name} base, 10 trajectories per {leaves}, 1.2 M states", 1.2e6 / rate / 3600, "hours", target)
+        y, rates = states(count, seed=1), []
+        for make in (lambda policy: policy, by_tensors):
+            policy = make(RolloutPolicy(problem.model, base, trajectories=10, leaves=leaves))
+            policy.q_factors(y[:600])
+            begin = time.perf_counter()
+            policy.q_factors(y)
+            rates.append(count / (time.perf_counter() - begin))
+        what = f"labels, {name} base, 10 trajectories per {leaves}, {count} states"
+        table.add(what, rates[0], "states/s")
+        table.add(f"{what}, over tensors", rates[0] / rates[1], target=target)
+        table.add(f"{what}: 1.2 M states", 1.2e6 / rates[0] / 3600, "hours")
 
 
 def adaptive(table: Table) -> None:
@@ -63,13 +76,11 @@ def adaptive(table: Table) -> None:
     for allocation, trajectories in settings:
         counted, samples = 0, []
         for seed in range(5):
-            base = Counting(GreedyRepair(problem.model))
-            policy = RolloutPolicy(
-                problem.model, base, trajectories=trajectories, allocation=allocation, seed=seed, chunk_rows=4096
-            )
+            base = GreedyRepair(problem.model)
+            policy = RolloutPolicy(problem.model, base, trajectories=trajectories, allocation=allocation, seed=seed)
             with threads(1):
                 u = policy.q_factors(y).argmin(-1, keepdim=True)
-            counted += base.rows
+            counted += policy.simulated_steps
             samples.append((reference.gather(-1, u).squeeze(-1) - reference.amin(-1)).double())
         name = f"{allocation}, {trajectories} trajectories"
         steps[name], regrets[name] = counted, torch.stack(samples).mean(0)
@@ -90,7 +101,7 @@ def expectation(table: Table) -> None:
     y = problem.start(torch.arange(count)).select(*model.state_keys)
     rows = y[torch.arange(count).repeat_interleave(trajectories)]
     keys = torch.arange(count * trajectories)
-    rollout = TruncatedRollout(model, greedy)
+    rollout = by_tensors(TruncatedRollout(model, greedy))
     with threads(1):
         needed = {}
         for name, simulate in (("expected", lambda: rollout(rows, keys)), ("realised", lambda: _realised(model, greedy, rows))):

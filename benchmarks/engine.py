@@ -13,14 +13,14 @@ import numpy as np
 import torch
 
 from benchmarks.harness import Table, seconds, threads
-from benchmarks.setting import Counting, line_problem, linear20, network_flops, networks
+from benchmarks.setting import Counting, by_tensors, line_problem, linear20, network_flops, networks
 from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.modules import TruncatedRollout, ZeroCost
-from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 
 
-def greedy(table: Table) -> None:
-    """Greedy rollouts on one core, eager and compiled, against the numba loop."""
+def trajectories(table: Table) -> None:
+    """Trajectories per second on one core: compiled loop, tensors, and for greedy a loop that carries the whole belief."""
     from benchmarks.numba_reference import greedy_rollout
 
     model, start = linear20().model, linear20().start
@@ -37,21 +37,41 @@ def greedy(table: Table) -> None:
             *next(inputs), keys.numpy().astype(np.uint64), rise, model.costs.numpy(), np.float32(0.99), 400, np.float32(1e-6)
         )
 
-    names = ("eager", "compiled")
-    rollouts = [TruncatedRollout(model, GreedyRepair(model), compile=name == "compiled") for name in names]
-    with threads(1):
-        costs, steps = loop()
-        errors = [np.abs(rollout(y, keys).numpy() - costs).max() for rollout in rollouts]
-        reference, *times = seconds(loop, *(partial(rollout, y, keys) for rollout in rollouts), repeats=repeats)
-    table.add("numba loop, one core", steps / reference / 1e6, "M steps/s")
-    for name, time_, error, target in zip(names, times, errors, (">= 0.20", ">= 0.40"), strict=True):
-        table.add(f"greedy rollout, {name}", steps / time_ / 1e6, "M steps/s")
-        table.add(f"greedy rollout, {name}, over the numba loop", reference / time_, target=target)
-        table.add(f"greedy rollout, {name}: largest difference of a cost from the loop's", float(error), "cost")
+    for name, base, target in (("greedy", GreedyRepair(model), ">= 30"), ("urgency", UrgencyRepair(model), ">= 20")):
+        compiled, tensors = TruncatedRollout(model, base), by_tensors(TruncatedRollout(model, base))
+        runs = [partial(compiled, y, keys), partial(tensors, y, keys)]
+        with threads(1):
+            error = float(((compiled(y, keys) - tensors(y, keys)).abs() / tensors(y, keys)).max())
+            steps, compiled.simulated_steps = compiled.simulated_steps, 0
+            fast, slow, *reference = seconds(*runs, *([loop] if name == "greedy" else []), repeats=repeats)
+        table.add(f"{name}: a trajectory of {steps / len(keys):.0f} steps, compiled loop", fast / len(keys) * 1e6, "us")
+        table.add(f"{name}: the same, tensors", slow / len(keys) * 1e6, "us")
+        table.add(f"{name}: compiled loop over tensors", slow / fast, target=target)
+        table.add(f"{name}: largest relative difference of a cost", error)
+        if reference:
+            table.add(f"{name}: compiled loop over the loop that carries beliefs", reference[0] / fast, target=">= 3")
+            table.add(f"{name}: tensors over that loop", reference[0] / slow, target=">= 0.20")
+
+
+def looks(table: Table) -> None:
+    """Time of a look of a greedy trajectory in the compiled loop, on one core, against the number of locations."""
+    base = 0.0
+    for size in (20, 50, 100, 200, 500):
+        model, start = line_problem(size)
+        keys = torch.arange(4096)
+        y = start(keys)
+        rollout = TruncatedRollout(model, GreedyRepair(model))
+        with threads(1):
+            rollout(y, keys)
+            steps, rollout.simulated_steps = rollout.simulated_steps, 0
+            look = seconds(partial(rollout, y, keys), repeats=5)[0] / steps
+        table.add(f"a look, L = {size}, {steps / len(keys):.0f} in a trajectory", look * 1e9, "ns")
+        base = base or look
+        table.add(f"a look, L = {size}, over L = 20", look / base, target="<= 1.5")
 
 
 def batch(table: Table) -> None:
-    """Greedy steps per second on one core against the number of trajectories that are simulated at once."""
+    """Greedy steps by tensors per second on one core, against the number of trajectories that are simulated at once."""
     model, start = linear20().model, linear20().start
     with threads(1):
         for rows in (16, 64, 256, 1024, 4096, 16_384, 65_536):
@@ -90,20 +110,25 @@ def network(table: Table) -> None:
         matrix = torch.rand(4096, 4096)
         peak = 2 * 4096**3 / seconds(lambda: matrix @ matrix)[0]
         table.add("large matrix product, one core", peak / 1e9, "GFlop/s")
-        for compile, targets in ((False, ">= 0.50"), (True, ">= 0.60")):
-            rollout = TruncatedRollout(model, policy, compile=compile)
-            rollout(y[:20_000], keys[:20_000])
-            policy.rows, spent[0], done[0] = 0, 0.0, 0
-            begin = time.perf_counter()
-            rollout(y, keys)
-            total, dense = time.perf_counter() - begin, policy.rows * network_flops()
-            name = "network rollout, " + ("compiled" if compile else "eager")
-            table.add(name, policy.rows / total / 1e6, "M steps/s")
-            table.add(f"{name}: rate of its products while they run, over the large product", done[0] / spent[0] / peak)
-            table.add(
-                f"{name}: dense products over all of its time, over the large product", dense / total / peak, target=targets
-            )
-            table.add(f"{name}: share of the dense products that is done", done[0] / dense)
+        rollout = TruncatedRollout(model, policy)
+        rollout(y[:20_000], keys[:20_000])
+        policy.rows, spent[0], done[0] = 0, 0.0, 0
+        begin = time.perf_counter()
+        rollout(y, keys)
+        total, dense = time.perf_counter() - begin, policy.rows * network_flops()
+        table.add("network rollout, tensors", policy.rows / total / 1e6, "M steps/s")
+        table.add("its rate of products while they run, over the large product", done[0] / spent[0] / peak)
+        table.add("its dense products over all of its time, over the large product", dense / total / peak, target=">= 0.50")
+        table.add("share of the dense products that is done", done[0] / dense)
+    compiled = TruncatedRollout(model, networks())
+    with threads(1):
+        compiled(y[:100], keys[:100])
+        compiled.simulated_steps = 0
+        begin = time.perf_counter()
+        compiled(y, keys)
+        rate = compiled.simulated_steps / (time.perf_counter() - begin)
+    table.add("network rollout, compiled loop", rate / 1e6, "M steps/s")
+    table.add("network rollout, compiled loop over tensors", rate / (policy.rows / total))
 
 
 def router(table: Table) -> None:
@@ -119,7 +144,7 @@ def router(table: Table) -> None:
 
 
 def locations(table: Table) -> None:
-    """Time of a greedy step against the number of locations, on one core."""
+    """Time of a greedy step by tensors against the number of locations, on one core."""
     base = 0.0
     with threads(1):
         for size in (20, 50, 100, 200, 500):
@@ -128,10 +153,10 @@ def locations(table: Table) -> None:
             y = start(keys)
             # The same number of bytes at once, whatever the size.
             cut = partial(TruncatedRollout, model, max_steps=40, terminal_cost=ZeroCost(), chunk_rows=len(keys))
-            rollout = cut(GreedyRepair(model))
-            policy = Counting(GreedyRepair(model))
-            cut(policy)(y, keys)
-            step = seconds(partial(rollout, y, keys))[0] / policy.rows
+            rollout = by_tensors(cut(GreedyRepair(model)))
+            rollout(y, keys)
+            steps, rollout.simulated_steps = rollout.simulated_steps, 0
+            step = seconds(partial(rollout, y, keys))[0] / steps
             table.add(f"greedy step, L = {size}", step * 1e9, "ns")
             base = base or step
             table.add(f"growth over linear from L = 20 to {size}", step / base / (size / 20), target="<= 1.2")
@@ -140,7 +165,7 @@ def locations(table: Table) -> None:
 _MEMORY = """
 import sys, torch
 from pathlib import Path
-from benchmarks.setting import line_problem
+from benchmarks.setting import by_tensors, line_problem
 from torchrl_pomdp.modules import TruncatedRollout, ZeroCost
 from torchrl_pomdp.modules.repair import GreedyRepair
 torch.set_num_threads(1)
@@ -151,9 +176,10 @@ model, start = line_problem(20, drift=0.01)
 keys = torch.arange(rows)
 # Few different states, so that making them takes no memory to speak of.
 y = start(torch.arange(1024))[keys % 1024]
-TruncatedRollout(model, GreedyRepair(model), max_steps=2, terminal_cost=ZeroCost(), chunk_rows=64)(y[:64], keys[:64])
+options = {"terminal_cost": ZeroCost(), "chunk_rows": rows}
+by_tensors(TruncatedRollout(model, GreedyRepair(model), max_steps=2, **options))(y[:64], keys[:64])
 before = peak()
-TruncatedRollout(model, GreedyRepair(model), max_steps=steps, terminal_cost=ZeroCost(), chunk_rows=rows)(y, keys)
+by_tensors(TruncatedRollout(model, GreedyRepair(model), max_steps=steps, **options))(y, keys)
 print((peak() - before) * 1024)
 """
 

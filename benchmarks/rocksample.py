@@ -23,13 +23,16 @@ def rocksample_updates(table: Table) -> None:
         y = RandomRocks(model)(keys)
         u = torch.multinomial(model.action_mask(y).float(), 1, generator=torch.Generator().manual_seed(0)).squeeze(-1)
         noise = uniform(keys, 0).unsqueeze(-1)
-        rollout = TruncatedRollout(model, NearestRock(model), max_steps=STEPS, terminal_cost=ZeroCost(), chunk_rows=ROWS)
+        make = partial(TruncatedRollout, model, NearestRock(model), max_steps=STEPS, terminal_cost=ZeroCost(), chunk_rows=ROWS)
+        rollout, fused = make(), make(compile=True)
         with threads(1), torch.inference_mode():
-            update, whole = seconds(partial(model.advance, y, u, noise), partial(rollout, y, keys), repeats=21)
+            runs = partial(model.advance, y, u, noise), partial(rollout, y, keys), partial(fused, y, keys)
+            update, whole, quick = seconds(*runs, repeats=21)
             before = rollout.simulated_steps
             rollout(y, keys)
         target = ">= 1" if n == 11 else ""
         table.add(f"RockSample({n}, {k}): belief updates, {ROWS} rows", ROWS / update / 1e6, "M updates/s", target)
+        table.add(f"RockSample({n}, {k}): compile=True over without", whole / quick)
         table.add(f"RockSample({n}, {k}): steps of base policy", (rollout.simulated_steps - before) / whole / 1e6, "M steps/s")
 
 

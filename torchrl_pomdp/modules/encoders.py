@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -14,7 +13,6 @@ from torchrl.data import Categorical
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.rowwise import rowwise
-from torchrl_pomdp.modules.scalar import Limited, ScalarEngine
 from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["Encoder", "FlatEncoder", "transformed"]
@@ -35,13 +33,6 @@ class Encoder(nn.Module):
     @abstractmethod
     def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
         """Features ``[M, F]`` of the rows ``rows`` (int64 ``[M]``, in that order; None: all) of a flat batch ``[N]``."""
-
-    def scalar_engine(self, policies: Sequence[Any], model: BeliefModel, limits: Limited) -> ScalarEngine | None:
-        """Compiled simulations of local policies, some of them networks with this encoder; None: there are none.
-
-        See :func:`~torchrl_pomdp.modules.scalar.scalar_engine`.
-        """
-        return None
 
     def first_layers(
         self, y: TensorDictBase, rows: Tensor, layers: Sequence[nn.Linear], counts: Sequence[int]

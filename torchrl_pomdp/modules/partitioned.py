@@ -14,7 +14,7 @@ from torchrl_pomdp.checks import check_instance, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.modules.networks import LocalNetwork, evaluate_networks
-from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
+from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, local_engine
 from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["PartitionedPolicy", "PartitionedValue"]
@@ -121,12 +121,8 @@ class PartitionedPolicy(_Partitioned):
         super().__init__("policies", policies)
 
     def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
-        """Compiled simulations, see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`: what the networks' encoder offers."""
-        networks = [policy for policy in self.policies if isinstance(policy, LocalNetwork)]
-        if networks:
-            return networks[0].encoder.scalar_engine(list(self.policies), model, limits)
-        same = all(policy is self.policies[0] for policy in self.policies)
-        return scalar_engine(self.policies[0], model, limits) if same else None
+        """Compiled simulations, see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`."""
+        return local_engine(list(self.policies), model, limits)
 
 
 class PartitionedValue(_Partitioned):

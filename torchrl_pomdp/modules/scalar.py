@@ -3,7 +3,7 @@ r"""What a compiled simulation is to the rollout: trajectories and Q-factors, on
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.truncation import Truncation
 
-__all__ = ["Allocation", "Cut", "Limited", "ScalarEngine", "scalar_engine"]
+__all__ = ["Allocation", "Cut", "Limited", "ScalarEngine", "local_engine", "offer_engines", "scalar_engine"]
 
 
 class Cut(NamedTuple):
@@ -113,6 +113,32 @@ class ScalarEngine(ABC):
             TypeError: by ``BeliefModel.check_state``.
             ValueError: likewise, or if the policy's twin chooses an illegal control.
         """
+
+
+LocalEngines = Callable[[Sequence[Any], BeliefModel, Limited], ScalarEngine | None]
+_OFFERED: dict[type[BeliefModel], LocalEngines] = {}
+
+
+def offer_engines(kind: type[BeliefModel], make: LocalEngines) -> None:
+    """Let ``make`` be asked for compiled simulations of local policies, networks among them, for models of a kind.
+
+    Args:
+        kind: the class of the models.
+        make: gives an engine, or None, for local policies, one for each part, a model and limits.
+    """
+    _OFFERED[kind] = make
+
+
+def local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+    """Compiled simulations of local policies, one for each part; None where there are none for the model, or for them.
+
+    Args:
+        policies: the policies; a single one for all parts.
+        model: the belief model.
+        limits: when trajectories end.
+    """
+    make = _OFFERED.get(type(model))
+    return None if make is None else make(policies, model, limits)
 
 
 def scalar_engine(policy: Any, model: BeliefModel, limits: Limited) -> ScalarEngine | None:

@@ -20,6 +20,7 @@ from torchrl_pomdp.envs.repair import CalibratedStart, Graph, RepairModel, Repai
 from torchrl_pomdp.modules import (
     AfterSteps,
     ConstantCost,
+    FlatEncoder,
     MultistepLookahead,
     OnEntering,
     OnLeaving,
@@ -224,20 +225,21 @@ def test_greedy_on_the_line_of_3_by_enumeration(line3):
 # ---- networks ------------------------------------------------------------------------------------------------------------
 
 
-def networks(model, others=(), hidden=(24, 12)):
-    encoder, generator = RelativeEncoder(model), torch.Generator().manual_seed(1)
+def networks(model, others=(), hidden=(24, 12), kind=RelativeEncoder):
+    encoder, generator = kind(model), torch.Generator().manual_seed(1)
     made = [PolicyNetwork(encoder, model.num_controls, hidden, generator=generator) for _ in range(6)]
     return PartitionedPolicy([others.get(part, made[part]) for part in range(6)] if others else made)
 
 
 @pytest.mark.parametrize("robots", [1, 2])
 @pytest.mark.parametrize("mixed", [False, True])
-def test_networks_choose_as_in_batches(robots, mixed):
+@pytest.mark.parametrize("kind", [RelativeEncoder, FlatEncoder])
+def test_networks_choose_as_in_batches(robots, mixed, kind):
     graph = grid(3, 3)
     model = RepairModel(graph, damage_chain((0.0, 0.02, 0.03, 0.05)), COSTS, 0.99, num_robots=robots)
     model = model.with_partition(RepairPartition(graph, model.costs))
     urgency = UrgencyRepair(model)
-    policy, y = networks(model, {3: urgency, 4: urgency} if mixed else ()), CalibratedStart(model)(torch.arange(20))
+    policy, y = networks(model, {3: urgency, 4: urgency} if mixed else (), kind=kind), CalibratedStart(model)(torch.arange(20))
 
     def make():
         return RolloutPolicy(model, policy, trajectories=2, max_steps=60, terminal_cost=NeverRepairCost(model))

@@ -129,7 +129,7 @@ class UrgencyRepair(TensorDictModuleBase):
         """Compiled simulations, see :class:`~torchrl_pomdp.modules.scalar.ScalarEngine`."""
         from torchrl_pomdp.modules.repair.scalar import engine, twins
 
-        data = self.nearness.double().numpy().T.copy(), float(model.costs[0]), max(self._prices)
+        data = self.nearness.double().numpy().T.copy(), float(self.model.costs[0]), max(self._prices)
         return engine.repair_engine(twins.urgency, data, self.model, model, limits, numbers=self.model.num_robots)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

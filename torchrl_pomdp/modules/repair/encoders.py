@@ -11,12 +11,10 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from torchrl_pomdp.checks import check_instance
-from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.repair.graphs import Graph
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.modules.encoders import Encoder, transformed
 from torchrl_pomdp.modules.rowwise import affine, align, align_terms
-from torchrl_pomdp.modules.scalar import Limited, ScalarEngine
 
 __all__ = ["RelativeEncoder"]
 
@@ -99,12 +97,6 @@ class RelativeEncoder(Encoder):
         if first is not None:
             return weight.narrow(0, first, count)
         return weight.index_select(0, nn.functional.pad(self.columns[place], (0, count - self.columns.shape[1])))
-
-    def scalar_engine(self, policies: Sequence[Any], model: BeliefModel, limits: Limited) -> ScalarEngine | None:
-        """See :class:`Encoder`."""
-        from torchrl_pomdp.modules.repair.scalar.networks import network_engine
-
-        return network_engine(self, policies, model, limits)
 
     def first_layers(
         self, y: TensorDictBase, rows: Tensor, layers: Sequence[nn.Linear], counts: Sequence[int]

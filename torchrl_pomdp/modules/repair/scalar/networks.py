@@ -3,68 +3,77 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
+from torchrl_pomdp.modules.encoders import FlatEncoder
 from torchrl_pomdp.modules.networks import PolicyNetwork
+from torchrl_pomdp.modules.repair.encoders import RelativeEncoder
 from torchrl_pomdp.modules.repair.scalar.engine import RepairEngine, repair_engine
 from torchrl_pomdp.modules.repair.scalar.twins import greedy, networks
-from torchrl_pomdp.modules.scalar import Limited, scalar_engine
-
-if TYPE_CHECKING:
-    from torchrl_pomdp.modules.repair.encoders import RelativeEncoder
+from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
 
 __all__ = ["network_engine"]
 
 
-def network_engine(
-    encoder: RelativeEncoder, policies: Sequence[Any], model: BeliefModel, limits: Limited
-) -> RepairEngine | None:
+def network_engine(policies: Sequence[Any], model: RepairModel, limits: Limited) -> ScalarEngine | None:
     """The engine of local policies, one for each part, of which some are networks; None where there is no twin for them.
 
     Args:
-        encoder: of all networks.
-        policies: networks of equal sizes in single precision, and at most one other policy, which has a twin.
+        policies: networks of equal sizes and in single precision, which see the state by one :class:`RelativeEncoder` or
+            :class:`~torchrl_pomdp.modules.FlatEncoder`; and at most one other policy, which has a twin.
         model: the model that is simulated.
         limits: see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`.
     """
     own = list(dict.fromkeys(policy for policy in policies if type(policy) is PolicyNetwork))
     others = list(dict.fromkeys(policy for policy in policies if policy not in own))
-    if len(others) > 1 or not isinstance(model, RepairModel) or not _alike(own, encoder):
+    base = scalar_engine(others[0], model, limits) if len(others) == 1 else None
+    if not own:
+        return base
+    features = _features(own[0].encoder, model)
+    parts = model.partition.num_parts if type(model.partition) is RepairPartition else 1
+    unknown = len(others) > 1 or (others and not isinstance(base, RepairEngine)) or len(policies) not in (1, parts)
+    if unknown or features is None or not _alike(own):
         return None
-    if (
-        encoder.columns.shape != (model.num_locations, model.num_locations * model.num_levels)
-        or encoder.num_robots != model.num_robots
-    ):
-        return None
-    if len(policies) > 1 and (type(model.partition) is not RepairPartition or model.partition.num_parts != len(policies)):
-        return None
-    base: Any = (greedy, (0.0,))
-    numbers = 1
-    if others:
-        engine = scalar_engine(others[0], model, limits)
-        if not isinstance(engine, RepairEngine):
-            return None
-        base, numbers = engine.policy, engine.numbers
     which = np.array([own.index(policy) if policy in own else -1 for policy in policies])
     layers = [[layer for layer in network.network if isinstance(layer, nn.Linear)] for network in own]
-    widest = max(encoder.num_robots * (encoder.columns.shape[1] + 1), *(layer.out_features for layer in layers[0]))
+    columns, places, robot_features, whole = features
+    widest = max(len(columns) * model.num_levels + 1, *(layer.out_features for layer in layers[0]))
     source = _Weights(layers)
-    data = which, encoder.columns.numpy(), encoder.places.numpy(), encoder.robot_features, *source.arrays(), base
-    return repair_engine(networks, data, model, model, limits, numbers=max(numbers, 3 * widest), refresh=source.refresh)
+    policy, numbers = (base.policy, base.numbers) if isinstance(base, RepairEngine) else ((greedy, (0.0,)), 1)
+    data = which, columns, places, robot_features, whole, *source.arrays(), policy
+    numbers = max(numbers, 3 * model.num_robots * widest)
+    return repair_engine(networks, data, model, model, limits, numbers=numbers, refresh=source.refresh)
 
 
-def _alike(own: Sequence[PolicyNetwork], encoder: RelativeEncoder) -> bool:
-    """Whether all networks have this encoder, and the same sizes in single precision."""
+def _features(encoder: Any, model: RepairModel) -> tuple[NDArray[np.int64], NDArray[np.int64], int, bool] | None:
+    """What is which feature of an encoder.
+
+    Which one is each number of the belief, ``[L, L * K]`` by a robot's location, and the location itself, ``[L]``; how many a
+    robot has; and whether they are the probabilities, or tell of level 0 whether damage is possible.
+    """
+    size, levels = model.num_locations, model.num_levels
+    if type(encoder) is RelativeEncoder:
+        known = encoder.columns.shape == (size, size * levels) and encoder.num_robots == model.num_robots
+        return (encoder.columns.numpy(), encoder.places.numpy(), encoder.robot_features, False) if known else None
+    if type(encoder) is FlatEncoder and encoder.num_features == size * (levels + model.num_robots):
+        columns = np.broadcast_to(np.arange(size * levels), (size, size * levels)).copy()
+        # Beliefs are seen once, and then a location by each robot.
+        return columns, np.arange(size * levels, size * (levels + 1)), size, True
+    return None
+
+
+def _alike(own: Sequence[PolicyNetwork]) -> bool:
+    """Whether all networks have one encoder, and the same sizes in single precision."""
     shapes = [[tuple(p.shape) for p in network.network.parameters()] for network in own]
     single = all(p.dtype == torch.float32 for network in own for p in network.network.parameters())
-    return single and all(network.encoder is encoder for network in own) and all(each == shapes[0] for each in shapes)
+    return single and all(network.encoder is own[0].encoder for network in own) and all(each == shapes[0] for each in shapes)
 
 
 class _Weights:

@@ -55,16 +55,19 @@ def urgency(data, view, controls):
 
 
 @inner
-def _features(view, columns, places, robot_features, work, size):
-    """Put what is not zero of the features into ``work``: where, then how much; returns how many there are."""
+def _features(view, columns, places, robot_features, whole, work, size):
+    """Put what is not zero of the features into ``work``: where, then how much; returns how many there are.
+
+    ``whole``: beliefs as they are, seen once; else by every robot, and of level 0 whether damage is possible.
+    """
     levels, count = view.start.shape[1], 0
     for robot in range(len(view.location)):
         origin, first = view.location[robot], robot * robot_features
-        for place in range(len(view.level)):
-            if view.intact[place] == 1.0:
+        for place in range(len(view.level) if robot == 0 or not whole else 0):
+            if view.intact[place] == 1.0 and not whole:
                 continue
             for k in range(levels):
-                value = 1.0 if k == 0 else probability(view, place, k)
+                value = 1.0 if k == 0 and not whole else probability(view, place, k)
                 if value > 0.0:
                     work[count], work[size + count] = first + columns[origin, place * levels + k], value
                     count += 1
@@ -127,19 +130,19 @@ def _best_control(view, work, at, width, controls):
 
 @scalar_twin
 def networks(data, view, controls):
-    """Policy networks on the features of :class:`~torchrl_pomdp.modules.repair.RelativeEncoder`, one for each part.
+    """Policy networks, one for each part.
 
-    ``data`` holds the number of each part's network, or -1 for the base policy; which feature is what; for every layer the
-    weights ``[network, in, out]`` and biases; and the base policy. Features and outputs that are zero cost nothing.
+    ``data`` holds the number of each part's network, or -1 for the base policy; which feature is what, and of which kind; for
+    every layer the weights ``[network, in, out]`` and biases; and the base policy. What is zero costs nothing.
     """
-    numbers, columns, places, robot_features, weights, biases, base = data
+    numbers, columns, places, robot_features, whole, weights, biases, base = data
     own = numbers[part_of(view) if len(numbers) > 1 else 0]
     if own < 0:
         choose(base, view, controls)
         return
     # The memory of the twin: rows of the weights that are met, their factors, outputs of a layer.
     work, size = view.work, len(view.work) // 3
-    count = _features(view, columns, places, robot_features, work, size)
+    count = _features(view, columns, places, robot_features, whole, work, size)
     last = len(weights) - 1
     for layer in range(last + 1):
         bias = biases[layer][own]
