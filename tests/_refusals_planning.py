@@ -305,6 +305,7 @@ MODULES = {
         trajectories=(1, integers(1)),
         leaves=("control", choices()),
         allocation=("uniform", choices()),
+        seconds=(0.001, numbers("(0, inf)")),
         seed=(0, integers()),
         compile=(False, flags()),
         **simulation(),
@@ -314,6 +315,7 @@ MODULES = {
         rollout().q_factors,
         y=(state(), states(state())),
         keys=(KEYS, [*keys(), Hostile("one key for two states", KEYS[:1]), Hostile("three keys", torch.arange(3))]),
+        seconds=(0.001, numbers("(0, inf)")),
     ),
     "modules.MultistepLookahead": lambda _: case(
         modules.MultistepLookahead, lambda made: made(state()),

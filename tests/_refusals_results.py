@@ -183,6 +183,9 @@ FILES = {
     "files.check_folder": lambda folder: case(
         lambda path: files.check_folder("path", path), path=(folder, [*paths(), Hostile("a file", written(folder / "a.json"))])
     ),
+    "files.read_text": lambda folder: case(
+        files.read_text, path=(written(folder / "a.json"), paths()), encoding=("utf-8", choices())
+    ),
     "files.read_json": lambda folder: case(files.read_json, path=(written(folder / "a.json"), paths())),
     "files.claim": lambda folder: case(
         files.claim,

@@ -13,6 +13,7 @@ from torchrl_pomdp.checks import check_callable, check_flag, check_instance, che
 from torchrl_pomdp.config import MAX_STATES
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.tensor_checks import check_tensor
@@ -124,7 +125,9 @@ class _Watched:
     def __init__(self, policy: Policy, bar: tqdm) -> None:
         self.policy, self.bar = policy, bar
         self.in_keys = getattr(policy, "in_keys", ())
-        self.scalar_engine = getattr(policy, "scalar_engine", None)
+
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+        return scalar_engine(self.policy, model, limits)
 
     def __call__(self, y: TensorDictBase) -> TensorDictBase:
         self.bar.update(y.batch_size.numel())

@@ -131,7 +131,7 @@ def test_what_is_to_be_compiled_copies_too(way):
         original = make(MODEL, GREEDY, compile=True)
         copied = WAYS[way](original)
         rollouts = [m for module in (original, copied) for m in module.modules() if isinstance(m, TruncatedRollout)]
-        assert [rollout._compiled for rollout in rollouts] == [True, True]
+        assert [rollout._compile for rollout in rollouts] == [True, True]
         assert rollouts[0]._transition is not rollouts[1]._transition
 
 

@@ -12,12 +12,20 @@ from torch._dynamo.utils import counters
 from torch._inductor import config as inductor_config
 
 from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, damage_chain, line
-from torchrl_pomdp.modules import AfterSteps, OnEntering, PartitionedPolicy, PolicyNetwork, RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.modules import (
+    AfterSteps,
+    PartitionedPolicy,
+    PolicyNetwork,
+    RolloutPolicy,
+    TruncatedRollout,
+    ZeroCost,
+)
 from torchrl_pomdp.modules.compiling import compiled
 from torchrl_pomdp.modules.lookahead import spread
-from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder
+from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.problems import tiger
+from torchrl_pomdp.problems.rocksample import rocksample
 
 
 def chain_model(size, drift=0.0, dtype=torch.float32):
@@ -65,26 +73,27 @@ def test_labels_can_be_trained_on(linear20):
     assert weight.grad is not None
 
 
-def test_compiled_and_eager_agree(line3):
-    """All that a step may hold: the stratified observations of several trajectories, and a rule that reads the part."""
-    model, y = line3.model, line3.start(torch.arange(30))
-    rule = {"truncation": OnEntering((3, 4, 5)) | AfterSteps(12), "terminal_cost": NeverRepairCost(model)}
-    options = {"trajectories": 3, **rule}
+def test_fused_and_eager_agree():
+    """All that a step may hold: the stratified observations of several trajectories, and a rule that cuts them."""
+    problem = rocksample(4, 3)
+    model, y = problem.model, problem.training[0](torch.arange(30))
+    options = {"trajectories": 3, "truncation": AfterSteps(12), "terminal_cost": ZeroCost()}
+    nearest = problem.base_policies["nearest"]
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="compile=True")
-        fast = RolloutPolicy(model, GreedyRepair(model), compile=True, **options).q_factors(y)
-    torch.testing.assert_close(fast, RolloutPolicy(model, GreedyRepair(model), **options).q_factors(y), rtol=1e-5, atol=1e-3)
+        fast = RolloutPolicy(model, nearest, compile=True, **options).q_factors(y)
+    torch.testing.assert_close(fast, RolloutPolicy(model, nearest, **options).q_factors(y), rtol=1e-5, atol=1e-3)
 
 
-def test_without_a_compiler_it_runs_as_it_is(line3):
-    keys = torch.arange(20)
-    y, greedy = line3.start(keys), GreedyRepair(line3.model)
+def test_without_a_compiler_it_runs_as_it_is():
+    problem, keys = rocksample(4, 3), torch.arange(20)
+    y, nearest = problem.start(keys), problem.base_policies["nearest"]
     with (
         inductor_config.patch({"cpp.cxx": ("/no/such/compiler",), "force_disable_caches": True}),
         pytest.warns(UserWarning, match="compile=True has no effect"),
     ):
-        cost = TruncatedRollout(line3.model, greedy, compile=True)(y, keys)
-    assert torch.equal(cost, TruncatedRollout(line3.model, greedy)(y, keys))
+        cost = TruncatedRollout(problem.model, nearest, compile=True)(y, keys)
+    assert torch.equal(cost, TruncatedRollout(problem.model, nearest)(y, keys))
 
 
 def test_each_compiled_function_has_its_own_limit_of_compilations():
@@ -141,18 +150,11 @@ def test_the_router_equals_its_networks(linear20):
 
 def test_adaptive_allocation_settles_clear_decisions_and_agrees_with_uniform(linear20):
     y = linear20.start(torch.arange(60))
-    steps = []
-
-    class Counting(GreedyRepair):
-        def forward(self, tensordict):
-            steps[-1] += tensordict.batch_size.numel()
-            return super().forward(tensordict)
-
-    q = []
+    q, steps = [], []
     for allocation in ("uniform", "adaptive"):
-        steps.append(0)
-        policy = RolloutPolicy(linear20.model, Counting(linear20.model), trajectories=40, allocation=allocation)
+        policy = RolloutPolicy(linear20.model, GreedyRepair(linear20.model), trajectories=40, allocation=allocation)
         q.append(policy.q_factors(y))
+        steps.append(policy.simulated_steps)
     assert steps[1] < 0.5 * steps[0]
     assert torch.equal(torch.isfinite(q[0]), torch.isfinite(q[1]))
     regret = q[0].gather(1, q[1].argmin(1, keepdim=True)).squeeze(1) - q[0].amin(1)

@@ -117,9 +117,9 @@ def test_terminal_costs_of_trajectories_that_are_not_cut_do_not_matter(linear20,
 
     cut = {"truncation": OnEntering((3, 4, 5)), "max_steps": 2000}
     q = RolloutPolicy(model, GreedyRepair(model), trajectories=2, terminal_cost=endgame_only, **cut).q_factors(beside)
-    assert torch.equal(
-        q, RolloutPolicy(model, GreedyRepair(model), trajectories=2, terminal_cost=never, **cut).q_factors(beside)
-    )
+    # In closed form the cost is rounded otherwise.
+    closed = RolloutPolicy(model, GreedyRepair(model), trajectories=2, terminal_cost=never, **cut).q_factors(beside)
+    torch.testing.assert_close(q, closed, rtol=1e-5, atol=0)
     assert all(asked)
 
 

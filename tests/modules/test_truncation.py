@@ -170,7 +170,9 @@ def test_no_trajectory_gets_the_terminal_cost_twice_and_terminal_ones_never(line
 
     # Trajectories that go on in place pass through several parts and would be cut again.
     rule = OnEntering((3, 5)) | AfterSteps(30)
-    Recording(linear20.model, GreedyRepair(linear20.model), truncation=rule, terminal_cost=damage, chunk_rows=64)(y, keys)
+    recording = Recording(linear20.model, GreedyRepair(linear20.model), truncation=rule, terminal_cost=damage, chunk_rows=64)
+    recording.scalar = None
+    recording(y, keys)
     assert sorted(cut) == list(range(20, 200))
 
 

@@ -141,7 +141,8 @@ class RolloutPolicy(TensorDictModuleBase):
             keys: keys of their scenarios ``[*B]``, for states that shall share them; by default those of :meth:`keys`.
             seconds: time for each state; by default that of the policy.
         """
-        seconds = self.seconds if seconds is None else seconds
+        check_instance("y", y, TensorDictBase)
+        seconds = self.seconds if seconds is None else check_number("seconds", seconds, "(0, inf)")
         engine = self.cost_to_go.scalar
         if engine is not None and engine.closed:
             return self._compiled(engine, y, keys, seconds)

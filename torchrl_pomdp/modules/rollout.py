@@ -237,7 +237,7 @@ class TruncatedRollout(nn.Module):
         check_integer("count", count, 1, MAX_TRAJECTORIES)
         total = torch.zeros(y.batch_size, dtype=self.model.dtype, device=self.model.device)
         with torch.inference_mode():
-            steps = (self._simulate if self.scalar is None else self._compiled)(y, scenarios, count, total)
+            steps = (self._simulate if self.scalar is None else self._by_loop)(y, scenarios, count, total)
         check_finite("simulated costs must be finite", total)
         self.count(steps)
         return total
@@ -247,11 +247,12 @@ class TruncatedRollout(nn.Module):
         with self._lock:
             self.simulated_steps += steps
 
-    def _compiled(self, y: TensorDictBase, scenarios: Scenarios, count: int, total: Tensor) -> int:
+    def _by_loop(self, y: TensorDictBase, scenarios: Scenarios, count: int, total: Tensor) -> int:
         """:meth:`_simulate` by the compiled loop, chunk by chunk."""
         steps, engine = 0, cast(ScalarEngine, self.scalar)
-        for rows in torch.arange(len(total)).split(self.chunk_rows):
-            first = slice(int(rows[0]), int(rows[-1]) + 1)
+        for begin in range(0, len(total), self.chunk_rows):
+            first = slice(begin, begin + self.chunk_rows)
+            rows = torch.arange(len(total))[first]
             costs, made, cut = engine.simulate(y[first], scenarios.rows(rows), count)
             total[first], steps = costs.to(total.dtype), steps + made
             if cut is not None:

@@ -144,15 +144,25 @@ def local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -
 def scalar_engine(policy: Any, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
     """Compiled simulations of a policy; None where policy or model offer none, on an accelerator, or without numba.
 
-    A policy offers them by a method ``scalar_engine(model, limits)``.
+    A policy offers them by a method ``scalar_engine(model, limits)``; one that overrides ``forward`` alone does not.
 
     Args:
         policy: the policy.
         model: the belief model.
         limits: when trajectories end.
     """
-    make = getattr(policy, "scalar_engine", None)
-    if make is None or model.device.type != "cpu" or find_spec("numba") is None:
+    if not _has_twin(policy) or model.device.type != "cpu" or find_spec("numba") is None:
         return None
-    engine: ScalarEngine | None = make(model, limits)
+    engine: ScalarEngine | None = policy.scalar_engine(model, limits)
     return engine
+
+
+def _has_twin(policy: Any) -> bool:
+    """Whether a policy offers compiled simulations of what it does, and not of what a class does that it overrides."""
+    hooks = getattr(policy, "_forward_hooks", None) or getattr(policy, "_forward_pre_hooks", None)
+    for kind in type(policy).__mro__:
+        if "scalar_engine" in vars(kind):
+            return not hooks
+        if "forward" in vars(kind) or "__call__" in vars(kind):
+            return False
+    return False

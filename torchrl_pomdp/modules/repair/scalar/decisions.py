@@ -215,7 +215,6 @@ def decide(policy, tables, limits, work, states, order, rounds, observations, cl
                     cost, more, state = _pair_cost(policy, tables, limits, work, start, origin, u, noise, observations)
                     if state == ILLEGAL:
                         return steps, row, True
-                    finite = finite and np.isfinite(cost)
                     costs[i, u] = cost
                     steps += more
                 made[u] += each
@@ -224,5 +223,8 @@ def decide(policy, tables, limits, work, states, order, rounds, observations, cl
                 _drop_beaten(costs, spent, rivals, clearly)
             if not _some(rivals):
                 break
-        _combine(costs, made, work.mask, states.q[row])
+        q = states.q[row]
+        _combine(costs, made, work.mask, q)
+        for u in range(len(q)):
+            finite = finite and (not work.mask[u] or np.isfinite(q[u]))
     return steps, -1, finite

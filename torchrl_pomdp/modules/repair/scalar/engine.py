@@ -58,7 +58,7 @@ def repair_engine(
         numbers: how many numbers of its own, ``view.work``, the twin needs.
         refresh: called before every simulation, to bring the data up to date.
     """
-    if not isinstance(model, RepairModel) or own.graph is not model.graph or not torch.equal(own.costs, model.costs):
+    if type(model) is not RepairModel or own.graph is not model.graph or not torch.equal(own.costs, model.costs):
         return None
     rules = () if limits.truncation is None else limits.truncation.rules
     known = all(type(rule) in (AfterSteps, OnEntering, OnLeaving) for rule in rules)

@@ -83,7 +83,7 @@ class _Weights:
         self.layers = [list(each) for each in zip(*layers, strict=True)]
         self.weights = tuple(self._stacked([layer.weight.T for layer in each]) for each in self.layers)
         self.biases = tuple(self._stacked([layer.bias for layer in each]) for each in self.layers)
-        self._versions = self._now()
+        self._versions: list[tuple[int, int]] = []
 
     def arrays(self) -> tuple[Any, Any]:
         """Weights ``[network, in, out]`` and biases ``[network, out]`` of every layer."""
@@ -93,11 +93,15 @@ class _Weights:
         """Copy the weights again if they have changed."""
         if (versions := self._now()) == self._versions:
             return
-        self._versions = versions
         for each, weight, bias in zip(self.layers, self.weights, self.biases, strict=True):
             for number, layer in enumerate(each):
                 weight[number] = layer.weight.detach().T.numpy()
                 bias[number] = layer.bias.detach().numpy()
+            for values in (weight, bias):
+                if not np.isfinite(values).all():
+                    wrong = values[~np.isfinite(values)][0]
+                    raise ValueError(f"logits of a network must be finite, got {wrong}: a weight is no number")
+        self._versions = versions
 
     def _now(self) -> list[tuple[int, int]]:
         return [(p.data_ptr(), p._version) for each in self.layers for layer in each for p in (layer.weight, layer.bias)]

@@ -26,7 +26,7 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
     distances = model.graph.distances.numpy()
     absorbing = model.level_zero_absorbing
     steady = absorbing and bool((chain[1:, 0] == 0).all())
-    own = model.partition if isinstance(model.partition, RepairPartition) else RepairPartition(model.graph, model.costs)
+    own = model.partition if isinstance(model.partition, RepairPartition) else None
     return Tables(
         powers=powers,
         cumulative=np.cumsum(powers, -1),
@@ -37,13 +37,13 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
         order=np.argsort(distances * size + np.arange(size), 1),
         first_controls=model.graph.first_controls.numpy(),
         first_moves=first_moves(model).numpy(),
-        columns=own.columns.double().numpy(),
-        prices=np.array(own.prices),
+        columns=np.zeros(size) if own is None else own.columns.double().numpy(),
+        prices=np.array(costs if own is None else own.prices, np.float64),
         absorbing=absorbing,
         steady=steady,
         free=steady and costs[0] == 0.0,
         terminal_probability=model.terminal_probability,
-        damage_threshold=own.damage_threshold,
-        low=own.density_bounds[0],
-        high=own.density_bounds[1],
+        damage_threshold=0.0 if own is None else own.damage_threshold,
+        low=0.0 if own is None else own.density_bounds[0],
+        high=0.0 if own is None else own.density_bounds[1],
     )
