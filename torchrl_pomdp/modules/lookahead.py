@@ -164,7 +164,7 @@ class RolloutPolicy(TensorDictModuleBase):
             keys = _checked_keys(keys, y).reshape(-1)
         q, steps = engine.q_factors(y, keys, self.seed, self._allocation(seconds))
         self.cost_to_go.count(steps)
-        return torch.from_numpy(q).view(*y.batch_size, self.model.num_controls)
+        return torch.from_numpy(q).to(self.model.dtype).view(*y.batch_size, self.model.num_controls)
 
     def _allocation(self, seconds: float | None) -> Allocation:
         return Allocation(

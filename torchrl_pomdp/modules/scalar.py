@@ -100,7 +100,9 @@ class ScalarEngine(ABC):
         """
 
     @abstractmethod
-    def q_factors(self, y: TensorDictBase, keys: Tensor | None, seed: int, allocation: Allocation) -> tuple[NDArray[Any], int]:
+    def q_factors(
+        self, y: TensorDictBase, keys: Tensor | None, seed: int, allocation: Allocation
+    ) -> tuple[NDArray[np.float64], int]:
         """Q-factors ``[N, U]`` of states of batch ``[*B]``, infinite where a control is illegal, and the number of steps.
 
         Args:

@@ -12,7 +12,7 @@ from typing import Any
 from numba import njit, typeof
 from numba.core.dispatcher import Dispatcher
 
-__all__ = ["OPTIONS", "code_digest", "entry", "inner", "outer", "products"]
+__all__ = ["OPTIONS", "code_digest", "entry", "inner", "outer", "products", "shared"]
 
 _LOG = logging.getLogger(__name__)
 # A compilation that takes longer, in seconds, is announced.
@@ -37,6 +37,12 @@ def outer(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     function.__qualname__ += f"_{code_digest(function)}"
     compiled: Callable[..., Any] = njit(error_model="numpy", cache=True, nogil=True, **_BARE)(function)
+    return compiled
+
+
+def shared(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a large part of several loops, which is compiled once and called."""
+    compiled: Callable[..., Any] = njit(error_model="numpy", **_BARE)(function)
     return compiled
 
 

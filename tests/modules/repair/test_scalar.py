@@ -173,9 +173,18 @@ def test_double_precision_agrees(linear20):
 
 
 @scalar_twin
-def wander(data, view, controls):
+def scripted(data, view, controls):
+    """As ``data[0]`` says: the first move; the way to where it costs most now; a control that may be illegal."""
+    mode, control = data
     for robot in range(len(controls)):
-        controls[robot] = view.tables.first_moves[view.location[robot]]
+        origin, best, target = view.location[robot], 0.0, -1
+        for place in range(len(view.level) if mode == 1 else 0):
+            cost = expected_cost(view, place)
+            if cost > best:
+                best, target = cost, place
+        controls[robot] = view.tables.first_moves[origin] if target < 0 else view.tables.first_controls[origin, target]
+        if mode == 2:
+            controls[robot] = control
 
 
 class Wanderer(TensorDictModuleBase):
@@ -188,7 +197,7 @@ class Wanderer(TensorDictModuleBase):
         self.model, self.moves = model, GreedyRepair(model).first_moves
 
     def scalar_engine(self, model, limits):
-        return repair_engine(wander, (0,), self.model, model, limits)
+        return repair_engine(scripted, (0, 0), self.model, model, limits)
 
     def forward(self, y):
         return y.set("action", self.model.join_controls(self.moves[y["location"]]))
@@ -299,33 +308,15 @@ def test_without_numba_tensors_do_all(linear20, monkeypatch):
 # ---- a twin of one's own -------------------------------------------------------------------------------------------------
 
 
-@scalar_twin
-def costliest(data, view, controls):
-    """Go to the location that costs most now."""
-    for robot in range(len(controls)):
-        best, target = 0.0, view.location[robot]
-        for place in range(len(view.level)):
-            cost = expected_cost(view, place)
-            if cost > best * data[0]:
-                best, target = cost, place
-        origin = view.location[robot]
-        controls[robot] = view.tables.first_controls[origin, target] if best > 0.0 else view.tables.first_moves[origin]
-
-
-@scalar_twin
-def stubborn(data, view, controls):
-    controls[:] = data[0]
-
-
 class Twinned(TensorDictModuleBase):
     in_keys, out_keys = ["belief", "location"], ["action"]
 
-    def __init__(self, model, twin, data):
+    def __init__(self, model, *data):
         super().__init__()
-        self.model, self.twin, self.data = model, twin, data
+        self.model, self.data = model, data
 
     def scalar_engine(self, model, limits):
-        return repair_engine(self.twin, self.data, self.model, model, limits)
+        return repair_engine(scripted, self.data, self.model, model, limits)
 
     def forward(self, y):
         costs = y["belief"] @ self.model.costs
@@ -339,7 +330,7 @@ def test_a_twin_of_ones_own(linear20):
     model, y = linear20.model, linear20.start(torch.arange(50))
 
     def make():
-        return RolloutPolicy(model, Twinned(model, costliest, (1.0,)), trajectories=3)
+        return RolloutPolicy(model, Twinned(model, 1, 0), trajectories=3)
 
     assert_close(make().q_factors(y), without(make).q_factors(y))
 
@@ -349,7 +340,7 @@ def test_an_illegal_control_of_a_twin_is_refused(linear20, control):
     model, y = linear20.model, linear20.start(torch.arange(50))
     y["location"][:] = 0
     y["belief"][:, 0] = torch.eye(5)[0]
-    policy = Twinned(model, stubborn, (control,))
+    policy = Twinned(model, 2, control)
     with pytest.raises(ValueError, match="base_policy chose an illegal control in a simulated trajectory"):
         TruncatedRollout(model, policy)(y, torch.arange(50))
     with pytest.raises(ValueError, match="base_policy chose an illegal control in a simulated trajectory"):

@@ -106,17 +106,15 @@ def _observation_weight(tables, work, start, origin):
 def _pair_cost(policy, tables, limits, work, start, origin, u, noise, observations):
     """Cost of a control and what follows it: in one trajectory, or in one from each observation, weighted."""
     base, levels, robots = tables.destinations.shape[1], start.shape[1], len(origin)
-    if not observations:
-        _robot_controls(u, base, work.controls)
-        cost, steps, _, _, state = trajectory(policy, tables, limits, _NEVER, work, start, origin, True, False, noise)
-        return cost, steps, state
     total, steps = 0.0, 0
-    for z in range(levels**robots):
+    for z in range(levels**robots if observations else 1):
         _robot_controls(u, base, work.controls)
-        _robot_controls(z, levels, work.seen)
-        weight = _observation_weight(tables, work, start, origin)
+        weight = 1.0
+        if observations:
+            _robot_controls(z, levels, work.seen)
+            weight = _observation_weight(tables, work, start, origin)
         if weight > 0.0:
-            cost, made, _, _, state = trajectory(policy, tables, limits, _NEVER, work, start, origin, True, True, noise)
+            cost, made, _, _, state = trajectory(policy, tables, limits, _NEVER, work, start, origin, True, observations, noise)
             if state == ILLEGAL:
                 return total, steps, state
             steps += made
@@ -178,7 +176,7 @@ def _combine(costs, made, mask, q):
 
 
 @outer
-def decide(policy, tables, limits, work, states, order, rounds, observations, clearly):
+def decide(policy, tables, limits, work, states, order, rounds, observations, clearly, largest):
     """Q-factors of states, or better ones of states that have been looked at before.
 
     Args:
@@ -191,6 +189,7 @@ def decide(policy, tables, limits, work, states, order, rounds, observations, cl
         rounds: numbers of trajectories of each round now, of all ``n`` that there may be.
         observations: whether a leaf is an observation.
         clearly: standard errors by which a control is beaten; infinite: none ever is.
+        largest: the largest number of the model's type.
 
     Returns:
         the number of steps, the state where a control was illegal, or -1, and whether all Q-factors of legal controls are
@@ -226,5 +225,5 @@ def decide(policy, tables, limits, work, states, order, rounds, observations, cl
         q = states.q[row]
         _combine(costs, made, work.mask, q)
         for u in range(len(q)):
-            finite = finite and (not work.mask[u] or np.isfinite(q[u]))
+            finite = finite and (not work.mask[u] or abs(q[u]) <= largest)
     return steps, -1, finite

@@ -139,7 +139,9 @@ class RepairEngine(ScalarEngine):
 
     # ---- decisions ---------------------------------------------------------------------------------------------------
 
-    def q_factors(self, y: TensorDictBase, keys: Tensor | None, seed: int, allocation: Allocation) -> tuple[NDArray[Any], int]:
+    def q_factors(
+        self, y: TensorDictBase, keys: Tensor | None, seed: int, allocation: Allocation
+    ) -> tuple[NDArray[np.float64], int]:
         """See :class:`ScalarEngine`."""
         self._bring_up_to_date()
         belief, location = self._checked(y)
@@ -148,7 +150,7 @@ class RepairEngine(ScalarEngine):
             self.model.check_state(y)
         streams = self._keys(belief, location, seed) if keys is None else np.ascontiguousarray(keys.numpy()).view(np.uint64)
         shape = len(beliefs), self.model.num_controls
-        q = np.empty(shape, belief.dtype)
+        q, largest = np.empty(shape), float(torch.finfo(self.model.dtype).max)
 
         def run(rows: slice) -> int:
             own, steps = q[rows], 0
@@ -156,12 +158,12 @@ class RepairEngine(ScalarEngine):
             states = Decisions(beliefs[rows], location[rows], streams[rows], costs, made, np.zeros(own.shape, np.bool_), own)
             for rounds in allocation.stretches():
                 more, wrong, finite = self._call_with_memory(
-                    decide, states, allocation.order, rounds, allocation.observations, allocation.clearly
+                    decide, states, allocation.order, rounds, allocation.observations, allocation.clearly, largest
                 )
                 if wrong >= 0:
                     self._refuse()
                 if not finite:
-                    check_q_factors(torch.from_numpy(own), self.model.action_mask(y).reshape(shape)[rows])
+                    check_q_factors(torch.from_numpy(own).to(self.model.dtype), self.model.action_mask(y).reshape(shape)[rows])
                 steps += more
                 if not states.rivals.any():
                     break

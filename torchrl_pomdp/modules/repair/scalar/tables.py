@@ -20,9 +20,11 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
     powers[0] = np.eye(levels)
     for n in range(1, stages):
         powers[n] = powers[n - 1] @ chain
-    stage_costs, discounts = powers @ costs, np.power(model.discount, np.arange(stages), dtype=np.float64)
-    interval_costs = np.zeros((stages, levels))
-    interval_costs[1:] = np.cumsum(discounts[:-1, None] * stage_costs[:-1], 0)
+    discounts = np.power(model.discount, np.arange(stages), dtype=np.float64)
+    stage_costs, interval_costs = powers @ costs, np.zeros((stages, levels))
+    # What overflows is refused where it is a result.
+    with np.errstate(over="ignore"):
+        interval_costs[1:] = np.cumsum(discounts[:-1, None] * stage_costs[:-1], 0)
     distances = model.graph.distances.numpy()
     absorbing = model.level_zero_absorbing
     steady = absorbing and bool((chain[1:, 0] == 0).all())

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_pomdp.modules.repair.scalar.view import View, legal, part_of, probability
-from torchrl_pomdp.scalar.compiling import inner, outer
+from torchrl_pomdp.scalar.compiling import inner, outer, shared
 from torchrl_pomdp.scalar.noise import scenario_noise, variable_bit
 from torchrl_pomdp.scalar.twins import choose
 
@@ -121,7 +121,7 @@ def set_initial(start, initial):
         initial[place] = known
 
 
-@inner
+@shared
 def _set_intact(view):
     """Bring up to date, for all locations, the probability that they are intact."""
     for place in range(len(view.level)):
@@ -181,7 +181,7 @@ def _interval_cost(view, place, stage):
     return total
 
 
-@inner
+@shared
 def _closed_cost(view, limits):
     """Terminal cost in closed form."""
     total = limits.constant
@@ -292,7 +292,7 @@ def trajectory(policy, tables, limits, after, work, start, origin, first, forced
     return cost, steps, cut, stage, FINE
 
 
-@inner
+@shared
 def _keep_state(tables, work, belief, location, stage):
     """Put a trajectory's state into ``belief``, its start until now, and ``location``."""
     view = View(stage, work.location, work.level, work.since, work.intact, belief, tables, work.numbers)

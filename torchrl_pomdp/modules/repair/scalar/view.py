@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_pomdp.scalar.compiling import inner
+from torchrl_pomdp.scalar.compiling import inner, shared
 
 __all__ = ["Tables", "View", "expected_cost", "intact", "legal", "part_of", "probability"]
 
@@ -129,7 +129,7 @@ def legal(view, robot, control):
     return tables.first_moves[place] == 0
 
 
-@inner
+@shared
 def part_of(view):
     """Part of a state, see :class:`~torchrl_pomdp.envs.repair.RepairPartition`."""
     tables, size, robots = view.tables, len(view.level), len(view.location)
