@@ -5,10 +5,17 @@ from __future__ import annotations
 import pytest
 
 BOTH = {"test_engine", "test_last_bit", "test_lookahead", "test_multistep", "test_parallel", "test_rollout", "test_truncation"}
+# Of these modules, tests of what tensors alone do.
+TENSORS = {
+    "test_each_compiled_function_has_its_own_limit_of_compilations",
+    "test_fused_and_eager_agree",
+    "test_realised_costs_with_independent_noise_make_rollout_worse_than_greedy",
+    "test_without_a_compiler_it_runs_as_it_is",
+}
 
 
 def pytest_generate_tests(metafunc):
-    if metafunc.module.__name__ in BOTH:
+    if metafunc.module.__name__ in BOTH and metafunc.function.__name__ not in TENSORS:
         metafunc.fixturenames.append("simulated_by")
         metafunc.parametrize("simulated_by", ["loop", "tensors"], indirect=True)
 

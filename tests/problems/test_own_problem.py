@@ -77,8 +77,8 @@ def single():
 own = {"__name__": "own_machine"}
 exec(compile(OWN, "own_machine.py", "exec"), own)
 CONFIG = PolicyIterationConfig(
-    iterations=2, samples_per_part=1000, value_samples=100, least_steps=500, epochs=1, hidden=(32,), value_hidden=(16,),
-    batch_size=64, validation_states=300,
+    iterations=2, samples_per_part=600, value_samples=100, least_steps=300, epochs=1, hidden=(32,), value_hidden=(16,),
+    batch_size=64, validation_states=200, max_steps=40,
 )  # fmt: skip
 SMALL = replace(CONFIG, samples_per_part=60, value_samples=30, least_steps=10, validation_states=40)
 
@@ -185,6 +185,10 @@ def test_the_command_trains_and_evaluates_it_in_fresh_processes(tmp_path):
         "60",
         "--hidden",
         "16",
+        "--max-steps",
+        "30",
+        "--online-states",
+        "0",
     ]
     told = command("train", "own_machine:problem", "--out", "run", *numbers)
     assert "threshold: 1.000 of threshold" in told
@@ -194,7 +198,7 @@ def test_the_command_trains_and_evaluates_it_in_fresh_processes(tmp_path):
 
 
 def test_a_run_of_it_has_a_folder_of_its_own(tmp_path):
-    config = PolicyIterationConfig(1, samples_per_part=40, least_steps=1, validation_states=50)
+    config = PolicyIterationConfig(1, samples_per_part=40, least_steps=1, validation_states=50, max_steps=20)
     run = TrainingRun(own["problem"](), config=config, states=20, online_states=0)
     assert list(run.carry_out(tmp_path / "run")) == ["threshold", "R-NT of threshold", "pAPI-NT 1"]
     best = load_checkpoint(tmp_path / "run" / "best.pt", problem=own["problem"]())
