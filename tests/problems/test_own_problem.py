@@ -77,8 +77,8 @@ def single():
 own = {"__name__": "own_machine"}
 exec(compile(OWN, "own_machine.py", "exec"), own)
 CONFIG = PolicyIterationConfig(
-    iterations=2, samples_per_part=600, value_samples=100, least_steps=300, epochs=1, hidden=(32,), value_hidden=(16,),
-    batch_size=64, validation_states=200, max_steps=40,
+    iterations=2, samples_per_part=1000, value_samples=100, least_steps=500, epochs=1, hidden=(32,), value_hidden=(16,),
+    batch_size=64, validation_states=300, max_steps=40,
 )  # fmt: skip
 SMALL = replace(CONFIG, samples_per_part=60, value_samples=30, least_steps=10, validation_states=40)
 
