@@ -2,7 +2,6 @@ r"""One-step lookahead with rollout at its leaves: the policy :math:`\tilde\mu` 
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 from typing import Literal
 
@@ -164,7 +163,8 @@ class RolloutPolicy(TensorDictModuleBase):
             keys = _checked_keys(keys, y).reshape(-1)
         q, steps = engine.q_factors(y, keys, self.seed, self._allocation(seconds))
         self.cost_to_go.count(steps)
-        return torch.from_numpy(q).to(self.model.dtype).view(*y.batch_size, self.model.num_controls)
+        single = self.model.dtype == torch.float32
+        return torch.from_numpy(q.astype(np.float32) if single else q).view(*y.batch_size, self.model.num_controls)
 
     def _allocation(self, seconds: float | None) -> Allocation:
         return Allocation(
@@ -310,11 +310,12 @@ def cheapest(q: Tensor) -> Tensor:
     """
     if q.numel() == 0:
         return torch.zeros(q.shape[:-1], dtype=torch.int64, device=q.device)
-    value, u = q.min(-1)
-    # For a single state the time of every operation counts; an infinite sum is looked at again.
-    if not math.isfinite(value.sum().item()) and not bool(torch.isfinite(value).all()):
+    # For a single state the time of every operation counts.
+    values = q.detach().cpu().numpy()
+    u = values.argmin(-1)
+    if not np.isfinite(values.min(-1)).all():
         raise ValueError("action_mask must allow at least one control in every state, got none")
-    return u
+    return torch.as_tensor(u).to(q.device)
 
 
 def spread(count: int) -> Tensor:

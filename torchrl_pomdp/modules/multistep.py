@@ -2,6 +2,8 @@ r"""Multistep lookahead: an :math:`\ell`-step problem with rollout at its end (p
 
 from __future__ import annotations
 
+from time import perf_counter
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -17,6 +19,8 @@ __all__ = ["MultistepLookahead"]
 
 # Root states that are expanded at once.
 _BLOCK = 256
+# With no time left, a state still gets the first trajectories.
+_LEAST_SECONDS = 1e-6
 # Stream of the drawn observations of a tree, apart from those of its trajectories, which are numbered from 0.
 _OBSERVATIONS = 1 << 32
 
@@ -77,14 +81,14 @@ class MultistepLookahead(TensorDictModuleBase):
             return self.policy.q_factors(y)
         # With a time for each decision, roots have trees of their own.
         size = _BLOCK if self.policy.seconds is None else 1
-        q = [self._expand(block, self.policy.keys(block), self.depth) for block in flat.split(size)]
+        q = [self._expand(block, self.policy.keys(block), self.depth, perf_counter()) for block in flat.split(size)]
         return torch.cat(q).view(*y.batch_size, -1)
 
-    def _expand(self, y: TensorDictBase, keys: Tensor, depth: int) -> Tensor:
-        """Q-factors ``[N, U]`` of states whose trees have the keys ``keys`` ``[N]``."""
+    def _expand(self, y: TensorDictBase, keys: Tensor, depth: int, begin: float) -> Tensor:
+        """Q-factors ``[N, U]`` of states whose trees have the keys ``keys`` ``[N]`` and were begun at ``begin``."""
         if depth == 1:
-            return self._rolled_out(y, keys)
-        model, mask = self.model, self._worthwhile(y, keys)
+            return self._rolled_out(y, keys, begin)
+        model, mask = self.model, self._worthwhile(y, keys, begin)
         state, u = mask.nonzero(as_tuple=True)
         pairs = take_rows(y, state)
         pair, observation, weight = self._observations(
@@ -92,7 +96,7 @@ class MultistepLookahead(TensorDictModuleBase):
             fold(fold(keys[state], _OBSERVATIONS), depth),
         )
         successors = model.estimator(take_rows(pairs, pair), u[pair], observation)
-        value = self._values(successors, keys[state[pair]], depth - 1)
+        value = self._values(successors, keys[state[pair]], depth - 1, begin)
         # [P, branches]: summed in a fixed order.
         ranks = torch.arange(pair.numel(), device=u.device) - torch.searchsorted(pair, pair)
         terms = value.new_zeros(int(ranks.max()) + 1, u.numel())
@@ -105,20 +109,22 @@ class MultistepLookahead(TensorDictModuleBase):
         check_q_factors(q, mask)
         return q
 
-    def _rolled_out(self, y: TensorDictBase, keys: Tensor) -> Tensor:
-        """One-step Q-factors ``[N, U]`` of states of a tree, which share the time of the decision."""
-        seconds = self.policy.seconds
+    def _rolled_out(self, y: TensorDictBase, keys: Tensor, begin: float) -> Tensor:
+        """One-step Q-factors ``[N, U]`` of states of a tree, which share what is left of the decision's time."""
+        if self.policy.seconds is None:
+            return self.policy.q_factors(y, keys)
+        left = max(_LEAST_SECONDS, self.policy.seconds - (perf_counter() - begin))
         calls = 1 if self.margin is None else self.depth
-        return self.policy.q_factors(y, keys, None if seconds is None else seconds / (calls * max(1, keys.numel())))
+        return self.policy.q_factors(y, keys, left / (calls * max(1, keys.numel())))
 
-    def _worthwhile(self, y: TensorDictBase, keys: Tensor) -> Tensor:
+    def _worthwhile(self, y: TensorDictBase, keys: Tensor, begin: float) -> Tensor:
         """Controls that are expanded, bool ``[N, U]``: the legal ones that are not dominated."""
         if self.margin is None:
             mask = self.model.action_mask(y)
             if not bool(mask.any(-1).all()):
                 raise ValueError("action_mask must allow at least one control in every state, got none")
             return mask
-        q = self._rolled_out(y, keys)
+        q = self._rolled_out(y, keys, begin)
         best = q.amin(-1, keepdim=True)
         return torch.isfinite(q) & (q <= best + self.margin * best.abs())
 
@@ -135,7 +141,7 @@ class MultistepLookahead(TensorDictModuleBase):
         order = pair.argsort(stable=True)
         return pair[order], torch.cat([observation, drawn.flatten()])[order], weight[order]
 
-    def _values(self, y: TensorDictBase, keys: Tensor, depth: int) -> Tensor:
+    def _values(self, y: TensorDictBase, keys: Tensor, depth: int, begin: float) -> Tensor:
         """Smallest Q-factors ``[N]``, zero at terminal states; equal states of a tree are expanded once."""
         value = torch.zeros(keys.shape, dtype=self.model.dtype, device=keys.device)
         live = (~self.model.is_terminal(y)).nonzero().squeeze(-1)
@@ -144,5 +150,5 @@ class MultistepLookahead(TensorDictModuleBase):
         same, inverse = fold(keys[live], self.model.fingerprint(y)[live]).unique(return_inverse=True)
         place = torch.empty_like(same).scatter_(0, inverse, torch.arange(live.numel(), device=same.device))
         chosen = live[place]
-        value[live] = self._expand(take_rows(y, chosen), keys[chosen], depth).amin(-1)[inverse]
+        value[live] = self._expand(take_rows(y, chosen), keys[chosen], depth, begin).amin(-1)[inverse]
         return value
