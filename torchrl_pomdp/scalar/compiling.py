@@ -36,7 +36,13 @@ def outer(function: Callable[..., Any]) -> Callable[..., Any]:
     It is kept on disk by its name, which a digest of the code in it makes another one when that changes.
     """
     function.__qualname__ += f"_{code_digest(function)}"
-    compiled: Callable[..., Any] = njit(error_model="numpy", cache=True, nogil=True, **_BARE)(function)
+    options = {"error_model": "numpy", "nogil": True, **_BARE}
+    compiled: Callable[..., Any]
+    try:
+        compiled = njit(cache=True, **options)(function)
+    except RuntimeError:
+        # There is no folder that can be written: each process compiles for itself.
+        compiled = njit(**options)(function)
     return compiled
 
 

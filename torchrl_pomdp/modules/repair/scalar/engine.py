@@ -47,7 +47,7 @@ def repair_engine(
     numbers: int = 1,
     refresh: Callable[[], None] | None = None,
 ) -> RepairEngine | None:
-    """The engine for a policy with a twin; None where the kernel does not know what is asked for.
+    """The engine for a policy with a twin; None where the loop does not know what is asked for, and tensors simulate.
 
     Args:
         twin: the policy.
@@ -57,6 +57,37 @@ def repair_engine(
         limits: when trajectories end.
         numbers: how many numbers of its own, ``view.work``, the twin needs.
         refresh: called before every simulation, to bring the data up to date.
+
+    Examples:
+        A policy of one's own, which goes where it costs most now; ``forward`` and twin choose the same:
+
+        >>> from tensordict.nn import TensorDictModuleBase
+        >>> from torchrl_pomdp.modules import TruncatedRollout
+        >>> from torchrl_pomdp.modules.repair.scalar import expected_cost
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.scalar import scalar_twin
+        >>> @scalar_twin
+        ... def costliest(data, view, controls):
+        ...     for robot in range(len(controls)):
+        ...         origin, best, target = view.location[robot], 0.0, -1
+        ...         for place in range(len(view.level)):
+        ...             cost = expected_cost(view, place)
+        ...             if cost > best:
+        ...                 best, target = cost, place
+        ...         controls[robot] = view.tables.first_controls[origin, target] if target >= 0 else view.tables.first_moves[origin]
+        >>> class Costliest(TensorDictModuleBase):
+        ...     in_keys, out_keys = ["belief", "location"], ["action"]
+        ...     def __init__(self, model):
+        ...         super().__init__()
+        ...         self.model = model
+        ...     def scalar_engine(self, model, limits):
+        ...         return repair_engine(costliest, (), self.model, model, limits)
+        ...     def forward(self, y):
+        ...         target = (y["belief"] @ self.model.costs).argmax(-1)
+        ...         return y.set("action", self.model.first_controls[y["location"][..., 0], target])
+        >>> model = make_problem("linear20").model
+        >>> type(TruncatedRollout(model, Costliest(model)).scalar).__name__
+        'RepairEngine'
     """
     if type(model) is not RepairModel or own.graph is not model.graph or not torch.equal(own.costs, model.costs):
         return None

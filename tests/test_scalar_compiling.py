@@ -1,0 +1,123 @@
+"""Compiled functions: their random numbers, their digests, where they are kept, and what is said of it."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from numba.core.dispatcher import Dispatcher
+
+from torchrl_pomdp import noise
+from torchrl_pomdp.modules.scenarios import Scenarios
+from torchrl_pomdp.scalar import compiling, scalar_twin
+from torchrl_pomdp.scalar.compiling import code_digest, entry, inner, outer
+from torchrl_pomdp.scalar.noise import finished, fold, hash_numbers, scenario_noise, uniform
+
+KEYS = noise.seed_keys(5, torch.arange(200))
+
+
+@outer
+def every(keys, members, names, steps, first, count, out):
+    for i in range(len(keys)):
+        out[i, 0] = uniform(keys[i], np.uint64(names[i]))
+        out[i, 1] = scenario_noise(fold(keys[i], np.uint64(1)), keys[i], members[i], count, first[i], names[i], steps[i])
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 1000])
+def test_random_numbers_are_those_of_tensors_to_the_last_bit(count):
+    generator = torch.Generator().manual_seed(count)
+    members = torch.randint(count, (200,), generator=generator)
+    names, steps = torch.randint(70, (200,), generator=generator), torch.randint(-2, 400, (200,), generator=generator)
+    first = torch.rand(200, generator=generator) < 0.5
+    out = np.empty((200, 2), np.float32)
+    unsigned = KEYS.numpy().view(np.uint64)
+    every(unsigned, members.numpy(), names.numpy(), steps.numpy(), first.numpy(), count, out)
+    assert torch.equal(torch.from_numpy(out[:, 0]), noise.uniform(KEYS, names))
+    seen = torch.where(first, 0, -1)
+    scenarios = Scenarios(noise.fold(KEYS, 1), KEYS, members, seen)
+    drawn, _ = scenarios.draw(steps, names.unsqueeze(-1), count)
+    assert torch.equal(torch.from_numpy(out[:, 1]), drawn[:, 0])
+
+
+@outer
+def hashed(bits, out):
+    for i in range(len(bits)):
+        out[i] = finished(hash_numbers(np.uint64(0), bits[i], 0))
+
+
+def test_fingerprints_are_those_of_tensors():
+    from tensordict import TensorDict
+
+    belief, out = torch.rand(7, 5, generator=torch.Generator().manual_seed(0)), np.empty(7, np.uint64)
+    hashed(belief.numpy().view(np.int32), out)
+    assert torch.equal(torch.from_numpy(out.view(np.int64)), noise.fingerprint(TensorDict({"belief": belief}, [7])))
+
+
+def test_a_digest_tells_code_constants_and_what_is_called_apart():
+    def make(number, other):
+        @inner
+        def called(x):
+            return x + other
+
+        def function(x):
+            return called(x) * number
+
+        return function
+
+    digests = {code_digest(make(number, other)) for number, other in [(1, 1), (2, 1), (1, 2)]}
+    assert len(digests) == 3
+    assert code_digest(make(1, 1)) == code_digest(make(1, 1))
+
+
+def test_a_twin_that_changes_is_another_type():
+    def make(control):
+        @scalar_twin
+        def twin(data, view, controls):
+            controls[0] = control
+
+        return twin
+
+    assert make(0).type == make(0).type != make(1).type
+
+
+def test_a_long_compilation_is_announced_and_a_short_one_is_not(caplog, monkeypatch):
+    def slow(x):
+        return x + 1
+
+    with caplog.at_level(logging.WARNING):
+        assert entry(outer(lambda x: x + 2), 1.5)(1.5) == 3.5
+        assert not caplog.records
+        monkeypatch.setattr(compiling, "_SOON", 0.0)
+        assert entry(outer(slow), 1.0)(1.0) == 2.0
+    assert [record.getMessage() for record in caplog.records] == ["compiling simulations, once: up to 20 seconds"]
+
+
+def test_where_nothing_can_be_written_every_process_compiles(monkeypatch):
+    def refuse(self):
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr(Dispatcher, "enable_caching", refuse)
+    assert outer(lambda x: 3 * x)(2) == 6
+
+
+SCRIPT = """
+from torchrl_pomdp.scalar.compiling import entry, outer
+@outer
+def triple(x):
+    return 3 * x
+entry(triple, 1.0)
+print(sum(triple.stats.cache_hits.values()), sum(triple.stats.cache_misses.values()))
+"""
+
+
+def test_a_second_process_reads_what_the_first_has_compiled(tmp_path):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    told = [
+        subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+        for _ in "ab"
+    ]
+    assert told == ["0 1\n", "1 0\n"]
