@@ -111,7 +111,8 @@ class TruncatedRollout(nn.Module):
     where a truncation rule says so: it may depend on the state.
 
     At most ``chunk_rows`` trajectories are simulated at a time. As they finish, waiting ones take their place, so that
-    every step works on a full chunk whatever the trajectories' lengths.
+    every step works on a full chunk whatever the trajectories' lengths. Where model and policy offer it, on a CPU with numba,
+    a compiled loop simulates them one by one instead: far faster, with the same noise, and the same costs up to rounding.
 
     Args:
         model: the belief model.
@@ -125,7 +126,7 @@ class TruncatedRollout(nn.Module):
         chunk_rows: largest number of trajectories simulated at once; bounds the memory, never changes the result. Powers of
             two are slower: planes that lie so far apart compete for the same lines of the cache.
         compile: whether to fuse policy and belief step by ``torch.compile``, see :func:`~.compiling.compiled`; worth its
-            time for long runs, or many single decisions, with simple base policies.
+            time for long runs with simple base policies, such as RockSample's. Where the compiled loop simulates it is not used.
 
     Attributes:
         simulated_steps: belief steps made so far.

@@ -74,7 +74,8 @@ def repair_engine(
         ...             cost = expected_cost(view, place)
         ...             if cost > best:
         ...                 best, target = cost, place
-        ...         controls[robot] = view.tables.first_controls[origin, target] if target >= 0 else view.tables.first_moves[origin]
+        ...         tables = view.tables
+        ...         controls[robot] = tables.first_moves[origin] if target < 0 else tables.first_controls[origin, target]
         >>> class Costliest(TensorDictModuleBase):
         ...     in_keys, out_keys = ["belief", "location"], ["action"]
         ...     def __init__(self, model):
