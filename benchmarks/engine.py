@@ -59,7 +59,7 @@ def looks(table: Table) -> None:
     base = 0.0
     for size in (20, 50, 100, 200, 500):
         model, start = line_problem(size)
-        keys = torch.arange(4096)
+        keys = torch.arange(4000)
         y = start(keys)
         rollout = TruncatedRollout(model, GreedyRepair(model))
         with threads(1):

@@ -126,7 +126,7 @@ class TruncatedRollout(nn.Module):
         chunk_rows: largest number of trajectories simulated at once; bounds the memory, never changes the result. Powers of
             two are slower: planes that lie so far apart compete for the same lines of the cache.
         compile: whether to fuse policy and belief step by ``torch.compile``, see :func:`~.compiling.compiled`; worth its
-            time for long runs with simple base policies, such as RockSample's. Where the compiled loop simulates it is not used.
+            time for long runs with simple base policies, such as RockSample's. Not used where the compiled loop simulates.
 
     Attributes:
         simulated_steps: belief steps made so far.

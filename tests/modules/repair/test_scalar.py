@@ -363,6 +363,9 @@ def test_states_are_checked_as_ever(linear20):
             policy.q_factors(wrong)
     with pytest.raises(TypeError, match="y must be a TensorDict"):
         policy.q_factors({"belief": 1})
+    learning = y.clone()
+    learning["belief"].requires_grad_()
+    assert torch.equal(policy.q_factors(learning), policy.q_factors(y))
     assert policy.q_factors(y[:0]).shape == (0, 3)
     assert policy.q_factors(y.reshape(2, 2)).shape == (2, 2, 3)
     assert policy.q_factors(y[0]).shape == (3,)

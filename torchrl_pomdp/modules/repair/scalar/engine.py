@@ -35,6 +35,8 @@ __all__ = ["RepairEngine", "repair_engine"]
 
 # Largest tables, in numbers; beyond, the tensors' way is taken.
 _MOST_NUMBERS = 1 << 22
+# Rows and states of a call of a compiled loop, which nothing can interrupt.
+_ROWS, _STATES = 4096, 256
 _NEVER = 1 << 60
 
 
@@ -160,7 +162,7 @@ class RepairEngine(ScalarEngine):
                 self._refuse()
             return int(steps)
 
-        steps = sum(self._threads(run, len(beliefs)))
+        steps = sum(self._threads(run, len(beliefs), _ROWS))
         left = (every.cut >= 0).nonzero()[0]
         return torch.from_numpy(every.total), steps, self._cut(left, every) if len(left) else None
 
@@ -201,7 +203,9 @@ class RepairEngine(ScalarEngine):
                     break
             return steps
 
-        return q, sum(self._threads(run, shape[0], 4096 if allocation.seconds is None else 1))
+        # Their trajectories' costs are kept until a state is decided. With a time for each, states are decided one by one.
+        block = max(1, min(_STATES, _MOST_NUMBERS // (len(allocation.order) * shape[1])))
+        return q, sum(self._threads(run, shape[0], block if allocation.seconds is None else 1))
 
     def _keys(self, belief: NDArray[Any], location: NDArray[np.int64], seed: int) -> NDArray[np.uint64]:
         # Adding zero turns -0.0, which compares equal to 0.0, into 0.0.
@@ -219,7 +223,7 @@ class RepairEngine(ScalarEngine):
 
     def _arrays(self, y: TensorDictBase) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Copies of beliefs ``[N, L, K]`` and locations ``[N, R]`` of checked states."""
-        return np.array(y.get("belief").numpy(), np.float64, order="C"), np.array(y.get("location").numpy(), order="C")
+        return np.array(y.get("belief").detach().numpy(), np.float64, order="C"), np.array(y.get("location").numpy(), order="C")
 
     def _checked(self, y: TensorDictBase) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Beliefs ``[N, L, K]`` and locations ``[N, R]`` of states ``[*B]``; raises unless kind and shape are right."""
@@ -230,7 +234,8 @@ class RepairEngine(ScalarEngine):
         for numbers, dtype, size in zip((belief, location), (model.dtype, torch.int64), own, strict=True):
             if not isinstance(numbers, Tensor) or numbers.dtype != dtype or numbers.shape != (*shape, *size):
                 model.check_state(y)
-        return belief.numpy().reshape(-1, *own[0]), np.ascontiguousarray(location.numpy().reshape(-1, *own[1]))
+        beliefs = belief.detach().numpy().reshape(-1, *own[0])
+        return beliefs, np.ascontiguousarray(location.numpy().reshape(-1, *own[1]))
 
     def _call(self, function: Any, *args: Any) -> Any:
         """Call a compiled loop. Arguments must have the same types and memory layouts at every call: nothing checks them."""
@@ -262,7 +267,7 @@ class RepairEngine(ScalarEngine):
             mask=np.empty(model.num_controls, np.bool_),
         )
 
-    def _threads(self, run: Any, count: int, block: int = 4096) -> list[int]:
+    def _threads(self, run: Callable[[slice], int], count: int, block: int) -> list[int]:
         threads = torch.get_num_threads()
         size = max(1, min(block, -(-count // threads)))
         return map_threads(run, [slice(i, min(i + size, count)) for i in range(0, count, size)], threads)
