@@ -138,6 +138,7 @@ class RepairEngine(ScalarEngine):
             parts=model.partition.num_parts if isinstance(model.partition, RepairPartition) else 1,
             closed=closed is not None,
             constant=constant,
+            by_level=bool((level_costs != 0).any()),
             level_costs=level_costs,
         )
 

@@ -39,6 +39,7 @@ class Limits(NamedTuple):
         parts: number of parts; 1: none is ever computed.
         closed: whether a cut adds ``constant`` and ``level_costs``; else cut trajectories report their states.
         constant: cost of a cut.
+        by_level: whether any of ``level_costs`` is not zero.
         level_costs: cost of a cut by the level of each location, ``[K]``.
     """
 
@@ -48,6 +49,7 @@ class Limits(NamedTuple):
     parts: int
     closed: bool
     constant: float
+    by_level: bool
     level_costs: NDArray[np.float64]
 
 
@@ -185,7 +187,7 @@ def _interval_cost(view, place, stage):
 def _closed_cost(view, limits):
     """Terminal cost in closed form."""
     total = limits.constant
-    for place in range(len(view.level)):
+    for place in range(len(view.level) if limits.by_level else 0):
         for k in range(view.start.shape[1]):
             total += probability(view, place, k) * limits.level_costs[k]
     return total
