@@ -240,9 +240,10 @@ def networks(model, others=(), hidden=(24, 12), kind=RelativeEncoder):
     return PartitionedPolicy([others.get(part, made[part]) for part in range(6)] if others else made)
 
 
-@pytest.mark.parametrize("robots", [1, 2])
-@pytest.mark.parametrize("mixed", [False, True])
-@pytest.mark.parametrize("kind", [RelativeEncoder, FlatEncoder])
+@pytest.mark.parametrize(
+    ("robots", "mixed", "kind"),
+    [(1, False, RelativeEncoder), (2, True, RelativeEncoder), (1, True, FlatEncoder), (2, False, FlatEncoder)],
+)
 def test_networks_choose_as_in_batches(robots, mixed, kind):
     graph = grid(3, 3)
     model = RepairModel(graph, damage_chain((0.0, 0.02, 0.03, 0.05)), COSTS, 0.99, num_robots=robots)
