@@ -142,7 +142,7 @@ class RolloutPolicy(TensorDictModuleBase):
         """
         check_instance("y", y, TensorDictBase)
         seconds = self.seconds if seconds is None else check_number("seconds", seconds, "(0, inf)")
-        engine = self.cost_to_go.scalar
+        engine = self.cost_to_go.engine()
         if engine is not None and engine.closed:
             return self._compiled(engine, y, keys, seconds)
         self.model.check_state(y)

@@ -32,6 +32,8 @@ them as ``"state_value"`` ``[*B]`` (costs, lower is better). ``in_keys``, where 
 CHUNK_ROWS = 16_000
 # Longest simulation and most trajectories of an estimate: there are tables of the one, and numbers of 24 bits for the other.
 MAX_STEPS, MAX_TRAJECTORIES = 1_000_000, 1 << 24
+# What a copy does not take along, nor a file.
+_OWN = {"_lock", "_members", "_transition", "scalar", "simulated_steps"}
 # States at which the first controls of a policy are checked.
 _CHECKED = 256
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
@@ -200,17 +202,26 @@ class TruncatedRollout(nn.Module):
         self.simulated_steps = 0
         # Several threads may share a rollout.
         self._lock = Lock()
+        self._make_engine()
+        self._transition = compiled(self._policy_and_step) if self._compile else self._policy_and_step
+
+    def _make_engine(self) -> None:
         limits = Limited(self.max_steps, self.truncation, self.terminal_cost)
         self.scalar = scalar_engine(self.base_policy, self.model, limits)
-        self._transition = compiled(self._policy_and_step) if self._compile else self._policy_and_step
+        self._members = self._policy_members()
+
+    def _policy_members(self) -> tuple[nn.Module, ...]:
+        return tuple(self.base_policy.modules()) if isinstance(self.base_policy, nn.Module) else ()
+
+    def engine(self) -> ScalarEngine | None:
+        """The compiled loop, made anew where modules of the base policy, such as local networks, have been replaced."""
+        if self.scalar is not None and self._policy_members() != self._members:
+            self._make_engine()
+        return self.scalar
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the lock, the compiled loop and the count: a copy starts its own."""
-        return {
-            key: value
-            for key, value in self.__dict__.items()
-            if key not in ("_lock", "_transition", "scalar", "simulated_steps")
-        }
+        return {key: value for key, value in self.__dict__.items() if key not in _OWN}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """The inverse of :meth:`__getstate__`."""
@@ -238,7 +249,11 @@ class TruncatedRollout(nn.Module):
         check_integer("count", count, 1, MAX_TRAJECTORIES)
         total = torch.zeros(y.batch_size, dtype=self.model.dtype, device=self.model.device)
         with torch.inference_mode():
-            steps = (self._simulate if self.scalar is None else self._by_loop)(y, scenarios, count, total)
+            engine = self.engine()
+            if engine is None:
+                steps = self._simulate(y, scenarios, count, total)
+            else:
+                steps = self._by_loop(engine, y, scenarios, count, total)
         check_finite("simulated costs must be finite", total)
         self.count(steps)
         return total
@@ -248,9 +263,9 @@ class TruncatedRollout(nn.Module):
         with self._lock:
             self.simulated_steps += steps
 
-    def _by_loop(self, y: TensorDictBase, scenarios: Scenarios, count: int, total: Tensor) -> int:
+    def _by_loop(self, engine: ScalarEngine, y: TensorDictBase, scenarios: Scenarios, count: int, total: Tensor) -> int:
         """:meth:`_simulate` by the compiled loop, chunk by chunk."""
-        steps, engine = 0, cast(ScalarEngine, self.scalar)
+        steps = 0
         for begin in range(0, len(total), self.chunk_rows):
             first = slice(begin, begin + self.chunk_rows)
             rows = torch.arange(len(total))[first]

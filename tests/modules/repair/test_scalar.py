@@ -272,6 +272,18 @@ def test_networks_that_are_trained_further_are_read_again(linear20):
     assert_close(after, without(lambda: TruncatedRollout(model, policy))(y, keys))
 
 
+def test_a_local_network_that_is_replaced_is_another_policy(linear20):
+    model, y, keys = linear20.model, linear20.start(torch.arange(20)), torch.arange(20)
+    policy, other = networks(model), networks(model)
+    cost, q = TruncatedRollout(model, policy), RolloutPolicy(model, policy, trajectories=2)
+    before = cost(y, keys), q.q_factors(y)
+    for part in range(6):
+        policy.policies[part] = other.policies[5 - part]
+    assert not torch.equal(cost(y, keys), before[0])
+    assert not torch.equal(q.q_factors(y), before[1])
+    assert_close(cost(y, keys), without(lambda: TruncatedRollout(model, policy))(y, keys))
+
+
 def test_what_the_loop_does_not_know_is_left_to_tensors(linear20):
     model = linear20.model
 
