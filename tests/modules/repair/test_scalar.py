@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
+from benchmarks.setting import by_tensors
 from torchrl_pomdp.envs import FunctionPartition, SinglePart
 from torchrl_pomdp.envs.repair import CalibratedStart, Graph, RepairModel, RepairPartition, damage_chain, grid, line
 from torchrl_pomdp.modules import (
@@ -43,11 +44,7 @@ COSTS = (0, 0.1, 1, 10, 100)
 
 def without(make):
     """What ``make`` makes, with the compiled loop taken out."""
-    made = make()
-    for part in made.modules():
-        if isinstance(part, TruncatedRollout):
-            part.scalar = None
-    return made
+    return by_tensors(make())
 
 
 def assert_close(compiled, tensors, share=0.001):

@@ -7,14 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_pomdp.modules.repair.scalar.trajectories import FINE, ILLEGAL, Noise, set_initial, trajectory
+from torchrl_pomdp.modules.repair.scalar.trajectories import FINE, ILLEGAL, NEVER, Noise, set_initial, trajectory
+from torchrl_pomdp.modules.repair.scalar.view import legal_at, split
 from torchrl_pomdp.scalar.compiling import inner, outer
 from torchrl_pomdp.scalar.noise import fold
 
 __all__ = ["Decisions", "decide"]
-
-# Steps after which no rule cuts.
-_NEVER = 1 << 60
 
 
 class Decisions(NamedTuple):
@@ -56,24 +54,14 @@ def _some(flags):
 
 
 @inner
-def _robot_controls(u, base, controls):
-    for robot in range(len(controls) - 1, -1, -1):
-        controls[robot] = u % base
-        u //= base
-
-
-@inner
 def _control_mask(tables, start, location, controls, mask):
     """Put into ``mask`` ``[U]`` which joint controls are legal."""
     for u in range(len(mask)):
-        _robot_controls(u, tables.destinations.shape[1], controls)
+        split(u, tables.destinations.shape[1], controls)
         fits = True
         for robot in range(len(location)):
-            place, control = location[robot], controls[robot]
-            if control > 0:
-                fits = fits and tables.destinations[place, control] >= 0
-            else:
-                fits = fits and bool(np.float32(start[place, 0]) < np.float32(1.0) or tables.first_moves[place] == 0)
+            place = location[robot]
+            fits = fits and legal_at(tables, place, np.float32(start[place, 0]) == np.float32(1.0), controls[robot])
         mask[u] = fits
 
 
@@ -108,13 +96,13 @@ def _pair_cost(policy, tables, limits, work, start, origin, u, noise, observatio
     base, levels, robots = tables.destinations.shape[1], start.shape[1], len(origin)
     total, steps = 0.0, 0
     for z in range(levels**robots if observations else 1):
-        _robot_controls(u, base, work.controls)
+        split(u, base, work.controls)
         weight = 1.0
         if observations:
-            _robot_controls(z, levels, work.seen)
+            split(z, levels, work.seen)
             weight = _observation_weight(tables, work, start, origin)
         if weight > 0.0:
-            cost, made, _, _, state = trajectory(policy, tables, limits, _NEVER, work, start, origin, True, observations, noise)
+            cost, made, _, _, state = trajectory(policy, tables, limits, NEVER, work, start, origin, True, observations, noise)
             if state == ILLEGAL:
                 return total, steps, state
             steps += made

@@ -20,7 +20,7 @@ from torchrl_pomdp.modules.lookahead import check_q_factors
 from torchrl_pomdp.modules.repair.scalar.decisions import Decisions, decide
 from torchrl_pomdp.modules.repair.scalar.states import fingerprints, valid
 from torchrl_pomdp.modules.repair.scalar.tables import make_tables
-from torchrl_pomdp.modules.repair.scalar.trajectories import Limits, Trajectories, Work, simulate
+from torchrl_pomdp.modules.repair.scalar.trajectories import NEVER, Limits, Trajectories, Work, simulate
 from torchrl_pomdp.modules.repair.terminal_costs import NeverRepairCost, SteadyStateCost
 from torchrl_pomdp.modules.scalar import Allocation, Cut, Limited, ScalarEngine
 from torchrl_pomdp.modules.scenarios import Scenarios
@@ -37,7 +37,6 @@ __all__ = ["RepairEngine", "repair_engine"]
 _MOST_NUMBERS = 1 << 22
 # Rows and states of a call of a compiled loop, which nothing can interrupt.
 _ROWS, _STATES = 4096, 256
-_NEVER = 1 << 60
 
 
 def repair_engine(
@@ -126,19 +125,18 @@ class RepairEngine(ScalarEngine):
         after = [rule.m for rule in rules if isinstance(rule, AfterSteps)]
         self._varying = [m for m in after if not isinstance(m, int)]
         entering = {part for rule in rules if isinstance(rule, OnEntering) for part in rule.parts}
-        # There is but one part to enter.
-        at_once = [0] if entering and not isinstance(model.partition, RepairPartition) else []
+        parted = isinstance(model.partition, RepairPartition)
+        # A single part is entered at once, and never left.
+        at_once = [0] if entering and not parted else []
         closed = _closed_form(model, limits.terminal_cost)
         self.closed = closed is not None and not self._varying
-        constant, level_costs = closed or (0.0, np.zeros(model.num_levels))
+        constant, level_costs = closed or (0.0, np.zeros(0))
         self.limits = Limits(
             max_steps=min([limits.max_steps, *at_once, *(m for m in after if isinstance(m, int))]),
-            entering=sum(1 << part for part in entering),
-            leaving=any(isinstance(rule, OnLeaving) for rule in rules),
-            parts=model.partition.num_parts if isinstance(model.partition, RepairPartition) else 1,
+            entering=sum(1 << part for part in entering) if parted else 0,
+            leaving=parted and any(isinstance(rule, OnLeaving) for rule in rules),
             closed=closed is not None,
             constant=constant,
-            by_level=bool((level_costs != 0).any()),
             level_costs=level_costs,
         )
 
@@ -147,8 +145,10 @@ class RepairEngine(ScalarEngine):
     def simulate(self, y: TensorDictBase, scenarios: Scenarios, count: int) -> tuple[Tensor, int, Cut | None]:
         """See :class:`ScalarEngine`."""
         self._bring_up_to_date()
-        beliefs, locations = self._arrays(y)
-        after = np.full(len(beliefs), _NEVER)
+        belief, location = self._checked(y)
+        # Copies, which the loop overwrites.
+        beliefs, locations = belief.astype(np.float64, order="C"), location.copy()
+        after = np.full(len(beliefs), NEVER)
         for m in self._varying:
             after = np.minimum(after, AfterSteps(m).start(self.model.derive(y))[:, 0].numpy())
         keys, groups, members, seen = (np.ascontiguousarray(numbers.numpy()) for numbers in scenarios)
@@ -222,10 +222,6 @@ class RepairEngine(ScalarEngine):
         if self._refresh is not None:
             self._refresh()
 
-    def _arrays(self, y: TensorDictBase) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Copies of beliefs ``[N, L, K]`` and locations ``[N, R]`` of checked states."""
-        return np.array(y.get("belief").detach().numpy(), np.float64, order="C"), np.array(y.get("location").numpy(), order="C")
-
     def _checked(self, y: TensorDictBase) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Beliefs ``[N, L, K]`` and locations ``[N, R]`` of states ``[*B]``; raises unless kind and shape are right."""
         model = self.model
@@ -282,7 +278,7 @@ class RepairEngine(ScalarEngine):
 
 def _closed_form(model: RepairModel, terminal_cost: Any) -> tuple[float, NDArray[np.float64]] | None:
     """A terminal cost as a constant and a cost for the level of each location; None where it is none of these."""
-    kind, nothing = type(terminal_cost), np.zeros(model.num_levels)
+    kind, nothing = type(terminal_cost), np.zeros(0)
     if terminal_cost is None or kind is ZeroCost:
         return 0.0, nothing
     if kind is ConstantCost:

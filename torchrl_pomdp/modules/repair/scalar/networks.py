@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
@@ -47,7 +47,7 @@ def network_engine(policies: Sequence[Any], model: RepairModel, limits: Limited)
     widest = max(len(columns) * model.num_levels + 1, *(layer.out_features for layer in layers[0]))
     source = _Weights(layers)
     policy, numbers = (base.policy, base.numbers) if isinstance(base, RepairEngine) else ((greedy, (0.0,)), 1)
-    data = which, columns, places, robot_features, whole, *source.arrays(), policy
+    data = which, columns, places, robot_features, whole, source.weights, source.biases, policy
     numbers = max(numbers, 3 * model.num_robots * widest)
     return repair_engine(networks, data, model, model, limits, numbers=numbers, refresh=source.refresh)
 
@@ -81,13 +81,11 @@ class _Weights:
 
     def __init__(self, layers: Sequence[Sequence[nn.Linear]]) -> None:
         self.layers = [list(each) for each in zip(*layers, strict=True)]
-        self.weights = tuple(self._stacked([layer.weight.T for layer in each]) for each in self.layers)
-        self.biases = tuple(self._stacked([layer.bias for layer in each]) for each in self.layers)
+        # Weights [network, in, out] and biases [network, out] of every layer, filled before the first simulation.
+        sizes = [(len(each), each[0].in_features, each[0].out_features) for each in self.layers]
+        self.weights = tuple(np.empty(size, np.float32) for size in sizes)
+        self.biases = tuple(np.empty((count, size), np.float32) for count, _, size in sizes)
         self._versions: list[tuple[int, int]] = []
-
-    def arrays(self) -> tuple[Any, Any]:
-        """Weights ``[network, in, out]`` and biases ``[network, out]`` of every layer."""
-        return self.weights, self.biases
 
     def refresh(self) -> None:
         """Copy the weights again if they have changed."""
@@ -105,7 +103,3 @@ class _Weights:
 
     def _now(self) -> list[tuple[int, int]]:
         return [(p.data_ptr(), p._version) for each in self.layers for layer in each for p in (layer.weight, layer.bias)]
-
-    @staticmethod
-    def _stacked(tensors: Sequence[Tensor]) -> Any:
-        return torch.stack([tensor.detach() for tensor in tensors]).contiguous().numpy()

@@ -20,8 +20,10 @@ from torchrl_pomdp.scalar.compiling import inner, outer, shared
 from torchrl_pomdp.scalar.noise import scenario_noise, variable_bit
 from torchrl_pomdp.scalar.twins import choose
 
-__all__ = ["FINE", "ILLEGAL", "Limits", "Noise", "Trajectories", "Work", "set_initial", "simulate", "trajectory"]
+__all__ = ["FINE", "ILLEGAL", "NEVER", "Limits", "Noise", "Trajectories", "Work", "set_initial", "simulate", "trajectory"]
 
+# Steps after which no rule cuts.
+NEVER = 1 << 60
 _NEVER_SEEN = -1
 # What ends a trajectory.
 _TERMINAL, _CUT, _GOES_ON = 0, 1, 2
@@ -36,20 +38,16 @@ class Limits(NamedTuple):
         max_steps: largest number of steps.
         entering: bits of the parts that cut.
         leaving: whether leaving the first part cuts.
-        parts: number of parts; 1: none is ever computed.
         closed: whether a cut adds ``constant`` and ``level_costs``; else cut trajectories report their states.
         constant: cost of a cut.
-        by_level: whether any of ``level_costs`` is not zero.
-        level_costs: cost of a cut by the level of each location, ``[K]``.
+        level_costs: cost of a cut by the level of each location, ``[K]``; ``[0]`` where it depends on none.
     """
 
     max_steps: int
     entering: int
     leaving: bool
-    parts: int
     closed: bool
     constant: float
-    by_level: bool
     level_costs: NDArray[np.float64]
 
 
@@ -187,8 +185,8 @@ def _interval_cost(view, place, stage):
 def _closed_cost(view, limits):
     """Terminal cost in closed form."""
     total = limits.constant
-    for place in range(len(view.level) if limits.by_level else 0):
-        for k in range(view.start.shape[1]):
+    for place in range(len(view.level)):
+        for k in range(len(limits.level_costs)):
             total += probability(view, place, k) * limits.level_costs[k]
     return total
 
@@ -228,7 +226,7 @@ def _ends(view, limits, after, age, own_part, witness):
         if over:
             return _TERMINAL, own_part, witness
     cut = age == limits.max_steps or age >= after
-    if limits.parts > 1 and (limits.entering != 0 or limits.leaving):
+    if limits.entering != 0 or limits.leaving:
         part = part_of(view)
         if age == 0:
             own_part = part

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_pomdp.modules.repair.scalar.view import expected_cost, intact, legal, part_of, probability
+from torchrl_pomdp.modules.repair.scalar.view import expected_cost, intact, legal, part_of, probability, split
 from torchrl_pomdp.scalar.compiling import inner, products
 from torchrl_pomdp.scalar.twins import choose, scalar_twin
 
@@ -115,17 +115,20 @@ def _positive(work, size, width):
 @inner
 def _best_control(view, work, at, width, controls):
     """The legal joint control with the largest logit, ties to the lower."""
-    robots, base, best, highest = len(controls), view.tables.destinations.shape[1], -1, -np.inf
+    base, best, highest = view.tables.destinations.shape[1], -1, -np.inf
     for u in range(width):
-        rest, fits = u, True
-        for robot in range(robots - 1, -1, -1):
-            fits = fits and legal(view, robot, rest % base)
-            rest //= base
+        split(u, base, controls)
+        fits = True
+        for robot in range(len(controls)):
+            fits = fits and legal(view, robot, controls[robot])
         if fits and work[at + u] > highest:
             best, highest = u, work[at + u]
-    for robot in range(robots - 1, -1, -1):
-        controls[robot] = best % base
-        best //= base
+    if best < 0 or highest == np.inf:
+        # Logits that have overflowed choose nothing.
+        for robot in range(len(controls)):
+            controls[robot] = -1
+    else:
+        split(best, base, controls)
 
 
 @scalar_twin

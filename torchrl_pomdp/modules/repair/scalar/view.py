@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchrl_pomdp.scalar.compiling import inner, shared
 
-__all__ = ["Tables", "View", "expected_cost", "intact", "legal", "part_of", "probability"]
+__all__ = ["Tables", "View", "expected_cost", "intact", "legal", "legal_at", "part_of", "probability", "split"]
 
 
 class Tables(NamedTuple):
@@ -117,16 +117,28 @@ def intact(view, place, threshold):
 
 
 @inner
-def legal(view, robot, control):
-    """Whether a robot may take a control."""
-    tables, place = view.tables, view.location[robot]
+def legal_at(tables, place, known_intact, control):
+    """Whether a robot may take a control at a location, which is known to be intact or not."""
     if not 0 <= control < tables.destinations.shape[1]:
         return False
     if control > 0:
         return tables.destinations[place, control] >= 0
-    if view.intact[place] < 1.0:
-        return True
-    return tables.first_moves[place] == 0
+    return not known_intact or tables.first_moves[place] == 0
+
+
+@inner
+def legal(view, robot, control):
+    """Whether a robot may take a control."""
+    place = view.location[robot]
+    return legal_at(view.tables, place, view.intact[place] == 1.0, control)
+
+
+@inner
+def split(number, base, digits):
+    """Put the base-``base`` digits of a joint control or observation into ``digits`` ``[R]``, robot 0 first."""
+    for robot in range(len(digits) - 1, -1, -1):
+        digits[robot] = number % base
+        number //= base
 
 
 @shared
@@ -143,13 +155,8 @@ def part_of(view):
         side = centre - tables.columns[place] * robots
         if side >= 1.0 or side <= -1.0:
             cost = 0.0
-            n, known = view.stage - view.since[place], view.level[place]
-            if known >= 0:
-                for k in range(view.start.shape[1]):
-                    cost += tables.powers[n, known, k] * tables.prices[k]
-            else:
-                for k in range(view.start.shape[1]):
-                    cost += probability(view, place, k) * tables.prices[k]
+            for k in range(view.start.shape[1]):
+                cost += probability(view, place, k) * tables.prices[k]
             if side >= 1.0:
                 left += cost
             else:
