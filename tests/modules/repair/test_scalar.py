@@ -269,6 +269,19 @@ def test_networks_that_are_trained_further_are_read_again(linear20):
     assert_close(after, without(lambda: TruncatedRollout(model, policy))(y, keys))
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_logits_that_overflow_choose_nothing(linear20, sign):
+    model, y = linear20.model, linear20.start(torch.arange(5))
+    policy = networks(model)
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.fill_(3e38)
+        for local in policy.policies:
+            local.network[-1].weight.fill_(sign * 3e38)
+    with pytest.raises(ValueError, match="base_policy chose an illegal control"):
+        TruncatedRollout(model, policy)(y, torch.arange(5))
+
+
 def test_a_local_network_that_is_replaced_is_another_policy(linear20):
     model, y, keys = linear20.model, linear20.start(torch.arange(20)), torch.arange(20)
     policy, other = networks(model), networks(model)
