@@ -14,6 +14,7 @@ from torchrl_pomdp.modules import PartitionedPolicy, PolicyNetwork, RolloutPolic
 from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.objectives import ClassificationLoss
 from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.trainers import PolicyIterationConfig, papi_nt, papi_t
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -80,3 +81,12 @@ def test_tabular_models_agree_with_the_cpu():
         )
         probs.append(model.observation_probs(y, u.to(device)).cpu())
     torch.testing.assert_close(*probs)
+
+
+def test_policy_iteration_trains_there():
+    problem = make_problem("line3", device="cuda")
+    config = PolicyIterationConfig(iterations=1, samples_per_part=64, value_samples=64, least_steps=3, validation_states=50)
+    for algorithm in (papi_nt, papi_t):
+        (iteration,) = algorithm(problem, config, GreedyRepair(problem.model))
+        for network in (*iteration.policy.policies, *iteration.value.values):
+            assert all(parameter.is_cuda and torch.isfinite(parameter).all() for parameter in network.parameters())

@@ -21,6 +21,7 @@ from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules.rollout import Policy, controls_of
+from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.progress import progress_bar
 
 __all__ = ["LabelCollector", "OnLabels"]
@@ -28,8 +29,8 @@ __all__ = ["LabelCollector", "OnLabels"]
 OnLabels = Callable[[int, bool], None]
 """Called with a number of labelled states, and whether an interrupted run had labelled them."""
 
-# States that are drawn, labelled and kept at once; the data do not depend on it. Many, because a rollout is slow at its end,
-# when few trajectories are left.
+# States that are drawn, labelled and kept at once on a CPU; the data do not depend on it. Many, because a rollout is slow at
+# its end, when few trajectories are left.
 _BLOCK = 16384
 # Most states of a batch, which is kept in memory.
 _LARGEST = 10**9
@@ -130,7 +131,7 @@ class LabelCollector(Collector):
         index = torch.arange(first, first + size, device=self.env.device)
         owner = "" if self.cache is None else digest([self.labeller, self.states])
         with progress_bar(size, "state", self.name, self.progress) as bar:
-            blocks = [self._block(numbers, owner, bar) for numbers in index.split(_BLOCK)]
+            blocks = [self._block(numbers, owner, bar) for numbers in index.split(rows_at_once(_BLOCK, index.device))]
         batch: Any = torch.cat(blocks, 0)
         batch.set(("collector", "traj_ids"), index)
         return batch.set(("collector", "mask"), torch.ones_like(index, dtype=torch.bool))

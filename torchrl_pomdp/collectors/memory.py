@@ -14,6 +14,7 @@ from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.rows import random_control, take_rows
 from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, controls_of
 from torchrl_pomdp.modules.scenarios import Scenarios
+from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import check_keys
 
@@ -21,7 +22,7 @@ __all__ = ["StateMemory"]
 
 # What a key's independent streams are for.
 _START, _STEPS, _EXPLORE, _CONTROL, _PICK = range(16, 21)
-# Trajectories that are followed at once.
+# Trajectories that are followed at once on a CPU.
 _BLOCK = 8192
 
 
@@ -98,7 +99,7 @@ class StateMemory:
         max_steps = check_integer("max_steps", self.model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
         if check_keys("keys", keys).ndim != 1:
             raise ValueError(f"keys must have shape [N], got {tuple(keys.shape)}")
-        for block in keys.split(_BLOCK):
+        for block in keys.split(rows_at_once(_BLOCK, keys.device)):
             visited: list[Any] = list(self._walk(policy, start, block, exploration, max_steps))
             if visited:
                 self._add(torch.cat(visited, 0))

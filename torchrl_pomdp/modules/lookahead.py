@@ -16,7 +16,7 @@ from torchrl_pomdp.checks import check_choice, check_instance, check_integer, ch
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.rollout import MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scalar import Allocation, ScalarEngine
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
@@ -96,7 +96,7 @@ class RolloutPolicy(TensorDictModuleBase):
         truncation: Truncation | None = None,
         terminal_cost: TerminalCost | None = None,
         seed: int = 0,
-        chunk_rows: int = CHUNK_ROWS,
+        chunk_rows: int | None = None,
         compile: bool = False,
     ) -> None:
         super().__init__()

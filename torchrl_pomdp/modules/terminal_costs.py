@@ -13,7 +13,7 @@ from torchrl_pomdp.checks import check_callable, check_instance, check_integer, 
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import CHUNK_ROWS, MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.rollout import MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
@@ -133,7 +133,7 @@ class PolicyCost(TensorDictModuleBase):
         terminal_cost: TerminalCost | None = None,
         max_steps: int | None = None,
         seed: int = 0,
-        chunk_rows: int = CHUNK_ROWS,
+        chunk_rows: int | None = None,
     ) -> None:
         super().__init__()
         self.model = check_instance("model", model, BeliefModel)

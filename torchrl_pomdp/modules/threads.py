@@ -13,13 +13,26 @@ from typing import TypeVar
 
 import torch
 
-__all__ = ["blocks", "kept_threads", "map_threads"]
+__all__ = ["blocks", "kept_threads", "map_threads", "rows_at_once"]
+
+# An accelerator does so many times more rows at once: fewer, and it waits for the next operation.
+_ON_ACCELERATOR = 16
 
 # Trajectories that are made at once, in chunks of the rollout: enough to keep its chunk full nearly all the time.
 _CHUNKS_PER_BLOCK = 8
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+def rows_at_once(on_cpu: int, device: torch.device) -> int:
+    """Rows that a device works on at once, where a CPU works best on ``on_cpu`` of them.
+
+    Examples:
+        >>> rows_at_once(1000, torch.device("cpu")), rows_at_once(1000, torch.device("cuda"))
+        (1000, 16000)
+    """
+    return on_cpu if device.type == "cpu" else _ON_ACCELERATOR * on_cpu
 
 
 def blocks(states: int, trajectories: int, chunk_rows: int, device: torch.device) -> tuple[int, int]:

@@ -94,11 +94,12 @@ def train_part(
         optimization_stepper=stepper,
         progress_bar=False,
     )
+    device = batch.device or torch.device("cpu")
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(size),
+        storage=LazyTensorStorage(size, device=device),
         sampler=SamplerWithoutReplacement(),
         batch_size=min(config.batch_size, size),
-        generator=torch.Generator().manual_seed(seed),
+        generator=torch.Generator(device).manual_seed(seed),
     )
     trainer.register_op("batch_process", partial(_store, buffer))
     trainer.register_op("process_optim_batch", lambda batch: buffer.sample())
