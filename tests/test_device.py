@@ -15,6 +15,7 @@ from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.objectives import ClassificationLoss
 from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import PolicyIterationConfig, papi_nt, papi_t
+from torchrl_pomdp.trainers.checkpoint import problem_digest
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -90,3 +91,8 @@ def test_policy_iteration_trains_there():
         (iteration,) = algorithm(problem, config, GreedyRepair(problem.model))
         for network in (*iteration.policy.policies, *iteration.value.values):
             assert all(parameter.is_cuda and torch.isfinite(parameter).all() for parameter in network.parameters())
+
+
+@pytest.mark.parametrize("name", ["linear20", "two_robots20", "rocksample"])
+def test_a_problem_is_the_same_there(name):
+    assert problem_digest(make_problem(name, device="cuda")) == problem_digest(make_problem(name))

@@ -122,8 +122,9 @@ class RandomState:
             raise ValueError(f"fractions must satisfy 0 <= low <= high <= 1, got {fractions}")
         self.model, self.max_age = model, check_integer("max_age", max_age, 0, _MOST_AGE)
         self.range = max(1, round(low * model.num_locations)), max(1, round(high * model.num_locations))
-        # A library's products of matrices may differ by the machine's threads; with so few numbers one thread does them.
-        self._powers = torch.stack([torch.linalg.matrix_power(model.chain, age) for age in range(max_age + 1)])
+        # A library's products of matrices may differ by device and threads; on a CPU one thread does so few numbers.
+        chain = model.chain.cpu()
+        self._powers = torch.stack([torch.linalg.matrix_power(chain, age) for age in range(max_age + 1)]).to(model.device)
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
