@@ -17,7 +17,7 @@ from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.truncation import Truncation
 
-__all__ = ["Allocation", "Cut", "Limited", "ScalarEngine", "local_engine", "offer_engines", "scalar_engine"]
+__all__ = ["Allocation", "Cut", "Limited", "Roots", "ScalarEngine", "local_engine", "offer_engines", "scalar_engine"]
 
 
 class Cut(NamedTuple):
@@ -69,6 +69,26 @@ class Allocation(NamedTuple):
             done = last
 
 
+class Roots(NamedTuple):
+    """States from which a search grows trees, see :mod:`torchrl_pomdp.scalar.models`.
+
+    Attributes:
+        model: scalar model and its data.
+        policy: scalar twin and its data.
+        keys: the states' streams of random numbers, uint64 ``[N]``.
+        state: makes the memory of the model for a state, by its number, with the state as root.
+        width: numbers that a state is kept in.
+        least: no policy costs less from any state.
+    """
+
+    model: tuple[Any, ...]
+    policy: tuple[Any, ...]
+    keys: NDArray[np.uint64]
+    state: Callable[[int], Any]
+    width: int
+    least: float
+
+
 class Limited(NamedTuple):
     """When the trajectories of a rollout end, see :class:`~torchrl_pomdp.modules.TruncatedRollout`."""
 
@@ -116,6 +136,15 @@ class ScalarEngine(ABC):
             ValueError: likewise, or if the policy's twin chooses an illegal control.
         """
 
+    @abstractmethod
+    def roots(self, y: TensorDictBase, seed: int) -> Roots:
+        """States ``[*B]``, checked, as roots of searches.
+
+        Args:
+            y: feature states.
+            seed: seed of their random numbers.
+        """
+
 
 LocalEngines = Callable[[Sequence[Any], BeliefModel, Limited], ScalarEngine | None]
 _OFFERED: dict[type[BeliefModel], LocalEngines] = {}
@@ -135,10 +164,12 @@ def local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -
     """Compiled simulations of local policies, one for each part; None where there are none for the model, or for them.
 
     Args:
-        policies: the policies; a single one for all parts.
+        policies: the policies; a single one for all parts; none: any legal control, all equally likely.
         model: the belief model.
         limits: when trajectories end.
     """
+    if model.device.type != "cpu" or find_spec("numba") is None:
+        return None
     make = _OFFERED.get(type(model))
     return None if make is None else make(policies, model, limits)
 

@@ -12,7 +12,7 @@ from typing import Any
 from numba import njit, typeof
 from numba.core.dispatcher import Dispatcher
 
-__all__ = ["OPTIONS", "code_digest", "entry", "inner", "outer", "products", "shared"]
+__all__ = ["OPTIONS", "Loops", "code_digest", "entry", "inner", "outer", "products", "shared"]
 
 _LOG = logging.getLogger(__name__)
 # A compilation that takes longer, in seconds, is announced.
@@ -75,6 +75,22 @@ def entry(function: Any, *args: Any) -> Callable[..., Any]:
     finally:
         timer.cancel()
     return compiled
+
+
+class Loops:
+    """Compiled loops that are called again and again with arguments of the same types and memory layouts.
+
+    Nothing checks these after the first call.
+    """
+
+    def __init__(self) -> None:
+        self._entries: dict[Any, Callable[..., Any]] = {}
+
+    def __call__(self, function: Any, *args: Any) -> Any:
+        """What ``function``, a loop made by :func:`outer`, gives for the arguments."""
+        if function not in self._entries:
+            self._entries[function] = entry(function, *args)
+        return self._entries[function](*args)
 
 
 def code_digest(function: Any) -> str:

@@ -5,18 +5,38 @@ They are those of the tensor functions to the last bit. Keys are unsigned here.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from torchrl_pomdp.modules.scenarios import BITS, LARGEST, STEPS
 from torchrl_pomdp.noise import FACTOR, GOLDEN, ROUNDS, STEP
 from torchrl_pomdp.scalar.compiling import inner
 
-__all__ = ["fold", "hash_numbers", "scenario_noise", "uniform", "variable_bit"]
+__all__ = ["Noise", "fold", "hash_numbers", "scenario_noise", "uniform", "variable_bit"]
 
 _GOLDEN, _FIRST, _SECOND = np.uint64(GOLDEN), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _FACTOR, _STEP, _STEPS = np.uint64(FACTOR), np.uint64(STEP), np.uint64(STEPS)
 _ONE, _ROUNDS, _BITS = np.uint64(1), ROUNDS, BITS
 _UNIT, _LARGEST = np.float32(2.0**-24), np.float32(LARGEST)
+
+
+class Noise(NamedTuple):
+    """The scenario of a trajectory, see :class:`~torchrl_pomdp.modules.scenarios.Scenarios`.
+
+    Attributes:
+        key: its stream.
+        group: key of the estimate.
+        member: its number in the estimate.
+        of: number of trajectories of the estimate.
+        seen: bits of the variables that have been observed.
+    """
+
+    key: np.uint64
+    group: np.uint64
+    member: int
+    of: int
+    seen: np.uint64
 
 
 @inner

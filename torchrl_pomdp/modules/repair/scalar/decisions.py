@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_pomdp.modules.repair.scalar.trajectories import FINE, ILLEGAL, NEVER, Noise, set_initial, trajectory
+from torchrl_pomdp.modules.repair.scalar.trajectories import FINE, ILLEGAL, NEVER, set_initial, trajectory
 from torchrl_pomdp.modules.repair.scalar.view import legal_at, split
 from torchrl_pomdp.scalar.compiling import inner, outer
-from torchrl_pomdp.scalar.noise import fold
+from torchrl_pomdp.scalar.noise import Noise, fold
 
 __all__ = ["Decisions", "decide"]
 

@@ -18,16 +18,17 @@ from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
 from torchrl_pomdp.modules.lookahead import check_q_factors
 from torchrl_pomdp.modules.repair.scalar.decisions import Decisions, decide
+from torchrl_pomdp.modules.repair.scalar.searches import History, repair_model
 from torchrl_pomdp.modules.repair.scalar.states import fingerprints, valid
 from torchrl_pomdp.modules.repair.scalar.tables import make_tables
 from torchrl_pomdp.modules.repair.scalar.trajectories import NEVER, Limits, Trajectories, Work, simulate
 from torchrl_pomdp.modules.repair.terminal_costs import NeverRepairCost, SteadyStateCost
-from torchrl_pomdp.modules.scalar import Allocation, Cut, Limited, ScalarEngine
+from torchrl_pomdp.modules.scalar import Allocation, Cut, Limited, Roots, ScalarEngine
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.terminal_costs import ConstantCost, ZeroCost
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.modules.truncation import AfterSteps, OnEntering, OnLeaving, Truncation
-from torchrl_pomdp.scalar.compiling import entry
+from torchrl_pomdp.scalar.compiling import Loops
 from torchrl_pomdp.scalar.twins import ScalarTwin
 from torchrl_pomdp.tensor_checks import SUM_TOLERANCE
 
@@ -119,7 +120,7 @@ class RepairEngine(ScalarEngine):
         refresh: Callable[[], None] | None,
     ) -> None:
         self.policy, self.model, self.numbers, self._refresh = policy, model, numbers, refresh
-        self._entries: dict[Any, Any] = {}
+        self._loops = Loops()
         self._spare: list[Work] = []
         self.tables = make_tables(model, limits.max_steps + 2)
         after = [rule.m for rule in rules if isinstance(rule, AfterSteps)]
@@ -216,6 +217,22 @@ class RepairEngine(ScalarEngine):
         self._call(fingerprints, bits, location, np.uint64(seed % (1 << 64)), keys)
         return keys
 
+    # ---- searches ----------------------------------------------------------------------------------------------------
+
+    def roots(self, y: TensorDictBase, seed: int) -> Roots:
+        """See :class:`ScalarEngine`."""
+        self._bring_up_to_date()
+        belief, location = self._checked(y)
+        beliefs = belief.astype(np.float64, order="C")
+
+        def state(number: int) -> History:
+            return History(beliefs[number], location[number], np.zeros(1, np.int64), self._work())
+
+        width = 1 + self.model.num_robots + 2 * self.model.num_locations
+        model = repair_model, (self.tables, self.limits)
+        least = self.model.num_locations * min(0.0, self.tables.least_cost) / (1.0 - self.model.discount)
+        return Roots(model, self.policy, self._keys(belief, location, seed), state, width, least)
+
     # ---- helpers -----------------------------------------------------------------------------------------------------
 
     def _bring_up_to_date(self) -> None:
@@ -235,10 +252,7 @@ class RepairEngine(ScalarEngine):
         return beliefs, np.ascontiguousarray(location.numpy().reshape(-1, *own[1]))
 
     def _call(self, function: Any, *args: Any) -> Any:
-        """Call a compiled loop. Arguments must have the same types and memory layouts at every call: nothing checks them."""
-        if function not in self._entries:
-            self._entries[function] = entry(function, *args)
-        return self._entries[function](*args)
+        return self._loops(function, *args)
 
     def _call_with_memory(self, function: Any, *args: Any) -> Any:
         """Call a compiled loop that simulates, with memory of its own for its time."""

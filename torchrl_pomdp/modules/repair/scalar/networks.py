@@ -16,7 +16,7 @@ from torchrl_pomdp.modules.encoders import FlatEncoder
 from torchrl_pomdp.modules.networks import PolicyNetwork
 from torchrl_pomdp.modules.repair.encoders import RelativeEncoder
 from torchrl_pomdp.modules.repair.scalar.engine import RepairEngine, repair_engine
-from torchrl_pomdp.modules.repair.scalar.twins import greedy, networks
+from torchrl_pomdp.modules.repair.scalar.twins import greedy, networks, random
 from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
 
 __all__ = ["network_engine"]
@@ -27,10 +27,13 @@ def network_engine(policies: Sequence[Any], model: RepairModel, limits: Limited)
 
     Args:
         policies: networks of equal sizes and in single precision, which see the state by one :class:`RelativeEncoder` or
-            :class:`~torchrl_pomdp.modules.FlatEncoder`; and at most one other policy, which has a twin.
+            :class:`~torchrl_pomdp.modules.FlatEncoder`; and at most one other policy, which has a twin. None: any legal
+            control.
         model: the model that is simulated.
         limits: see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`.
     """
+    if not policies:
+        return repair_engine(random, (), model, model, limits)
     own = list(dict.fromkeys(policy for policy in policies if type(policy) is PolicyNetwork))
     others = list(dict.fromkeys(policy for policy in policies if policy not in own))
     base = scalar_engine(others[0], model, limits) if len(others) == 1 else None

@@ -15,12 +15,33 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_pomdp.modules.repair.scalar.events import (
+    bits_after,
+    interval_cost,
+    look,
+    moved,
+    set_intact,
+    take_in,
+    terminal,
+)
 from torchrl_pomdp.modules.repair.scalar.view import View, legal, part_of, probability
 from torchrl_pomdp.scalar.compiling import inner, outer, shared
-from torchrl_pomdp.scalar.noise import scenario_noise, variable_bit
+from torchrl_pomdp.scalar.noise import Noise
 from torchrl_pomdp.scalar.twins import choose
 
-__all__ = ["FINE", "ILLEGAL", "NEVER", "Limits", "Noise", "Trajectories", "Work", "set_initial", "simulate", "trajectory"]
+__all__ = [
+    "FINE",
+    "ILLEGAL",
+    "NEVER",
+    "Limits",
+    "Trajectories",
+    "Work",
+    "begin",
+    "continued",
+    "set_initial",
+    "simulate",
+    "trajectory",
+]
 
 # Steps after which no rule cuts.
 NEVER = 1 << 60
@@ -66,24 +87,6 @@ class Work(NamedTuple):
     mask: NDArray[np.bool_]
 
 
-class Noise(NamedTuple):
-    """The scenario of a trajectory, see :class:`~torchrl_pomdp.modules.scenarios.Scenarios`.
-
-    Attributes:
-        key: its stream.
-        group: key of the estimate.
-        member: its number in the estimate.
-        of: number of trajectories of the estimate.
-        seen: bits of the variables that have been observed.
-    """
-
-    key: np.uint64
-    group: np.uint64
-    member: int
-    of: int
-    seen: np.uint64
-
-
 class Trajectories(NamedTuple):
     """Trajectories that start in states of their own.
 
@@ -122,66 +125,6 @@ def set_initial(start, initial):
 
 
 @shared
-def _set_intact(view):
-    """Bring up to date, for all locations, the probability that they are intact."""
-    for place in range(len(view.level)):
-        view.intact[place] = np.float32(probability(view, place, 0))
-
-
-@inner
-def _terminal(view, witness):
-    """Whether the state is terminal, see :meth:`~torchrl_pomdp.envs.repair.RepairModel.is_terminal`; a witness if it is not.
-
-    A single location that may be damaged tells that it is not; the one that did so last is asked first.
-    """
-    product, size = 1.0, len(view.level)
-    for i in range(size):
-        place = witness + i if witness + i < size else witness + i - size
-        product *= view.intact[place]
-        if not 1.0 - product <= view.tables.terminal_probability:
-            return False, place
-    return True, witness
-
-
-@inner
-def _draw_level(view, place, noise):
-    """Level that a robot sees at ``place`` at the next stage."""
-    tables, levels = view.tables, view.start.shape[1]
-    n, known = view.stage + 1 - view.since[place], view.level[place]
-    if known >= 0:
-        threshold = noise * tables.cumulative[n, known, levels - 1]
-        for level in range(levels - 1):
-            if tables.cumulative[n, known, level] > threshold:
-                return level
-        return levels - 1
-    threshold, reached, possible = np.float64(noise), 0.0, 0
-    for level in range(levels):
-        here = 0.0
-        for k in range(levels):
-            here += view.start[place, k] * tables.powers[n, k, level]
-        reached += here
-        if here > 0.0:
-            possible = level
-            if reached > threshold:
-                break
-    # Marginals sum to one but for rounding: what is left belongs to the last level that is possible.
-    return possible
-
-
-@inner
-def _interval_cost(view, place, stage):
-    """Discounted cost of a location from when it was last seen until ``stage``."""
-    tables, since, known = view.tables, view.since[place], view.level[place]
-    n = stage - since
-    if known >= 0:
-        return tables.discounts[since] * tables.interval_costs[n, known]
-    total = 0.0
-    for k in range(view.start.shape[1]):
-        total += view.start[place, k] * tables.interval_costs[n, k]
-    return total
-
-
-@shared
 def _closed_cost(view, limits):
     """Terminal cost in closed form."""
     total = limits.constant
@@ -192,37 +135,10 @@ def _closed_cost(view, limits):
 
 
 @inner
-def _look(view, controls, levels, forced, noise, seen, age):
-    """The robots move and look: puts what they see into ``levels``; returns the variables that have been seen."""
-    tables, robots = view.tables, len(view.location)
-    after = seen
-    for robot in range(robots):
-        view.location[robot] = tables.destinations[view.location[robot], controls[robot]]
-    for robot in range(robots):
-        place = view.location[robot]
-        bit = variable_bit(place)
-        first, after = (seen & bit) == 0, after | bit
-        if forced:
-            continue
-        level = 0 if tables.steady and view.intact[place] == 1.0 else -1
-        for other in range(robots):
-            if view.location[other] == place and controls[other] == 0:
-                level = 0
-        for other in range(robot):
-            if view.location[other] == place:
-                level = levels[other]
-        if level < 0:
-            number = scenario_noise(noise.key, noise.group, noise.member, noise.of, first, place, age * robots + robot)
-            level = _draw_level(view, place, number)
-        levels[robot] = level
-    return after
-
-
-@inner
 def _ends(view, limits, after, age, own_part, witness):
-    """Whether a trajectory goes on, and which part it has started in and what :func:`_terminal` remembers."""
+    """Whether a trajectory goes on, and which part it has started in and what :func:`terminal` remembers."""
     if view.tables.absorbing:
-        over, witness = _terminal(view, witness)
+        over, witness = terminal(view, witness)
         if over:
             return _TERMINAL, own_part, witness
     cut = age == limits.max_steps or age >= after
@@ -232,6 +148,52 @@ def _ends(view, limits, after, age, own_part, witness):
             own_part = part
         cut = cut or (limits.entering >> part) & 1 == 1 or (limits.leaving and part != own_part)
     return _CUT if cut else _GOES_ON, own_part, witness
+
+
+@inner
+def begin(work, start, origin):
+    """Put the state at stage 0 into ``work``."""
+    for robot in range(len(origin)):
+        work.location[robot] = origin[robot]
+    for place in range(start.shape[0]):
+        work.level[place], work.since[place], work.intact[place] = work.initial[place], 0, np.float32(start[place, 0])
+
+
+@inner
+def continued(policy, tables, limits, after, work, start, stage, cost, first, forced, noise):
+    """The rest of a :func:`trajectory` whose state at ``stage`` is in ``work``, and which has cost ``cost`` so far.
+
+    What locations cost is added when they are seen again, and at the end: until then ``cost`` lacks it.
+    """
+    size, robots = start.shape[0], len(work.location)
+    steps, seen, own_part, witness = 0, noise.seen, 0, 0
+    while True:
+        view = View(stage, work.location, work.level, work.since, work.intact, start, tables, work.numbers, noise.key)
+        age = stage - 1 if first else stage
+        if not tables.steady and stage > 0:
+            set_intact(view)
+        if age >= 0:
+            ended, own_part, witness = _ends(view, limits, after, age, own_part, witness)
+            if ended != _GOES_ON:
+                break
+            choose(policy, view, work.controls)
+            for robot in range(robots):
+                if not legal(view, robot, work.controls[robot]):
+                    return cost, steps, False, stage, ILLEGAL
+            steps += 1
+        moved(view, work.controls)
+        if not (forced and age < 0):
+            look(view, work.controls, work.seen, noise, seen, age)
+        seen = bits_after(view, seen)
+        cost += take_in(view, work.seen)
+        stage += 1
+    for place in range(size):
+        if not tables.free or work.intact[place] < 1.0:
+            cost += interval_cost(view, place, stage)
+    cut = ended == _CUT
+    if cut and limits.closed:
+        cost += tables.discounts[stage] * _closed_cost(view, limits)
+    return cost, steps, cut, stage, FINE
 
 
 @inner
@@ -253,49 +215,14 @@ def trajectory(policy, tables, limits, after, work, start, origin, first, forced
     Returns:
         its cost from ``start`` on, its steps, whether it was cut, at which stage it ended, and whether all was well.
     """
-    size, robots = start.shape[0], len(origin)
-    location, level, since, known = work.location, work.level, work.since, work.intact
-    for robot in range(robots):
-        location[robot] = origin[robot]
-    for place in range(size):
-        level[place], since[place], known[place] = work.initial[place], 0, np.float32(start[place, 0])
-    cost, steps, stage, seen, own_part, witness = 0.0, 0, 0, noise.seen, 0, 0
-    while True:
-        view = View(stage, location, level, since, known, start, tables, work.numbers)
-        age = stage - 1 if first else stage
-        if not tables.steady and stage > 0:
-            _set_intact(view)
-        if age >= 0:
-            ended, own_part, witness = _ends(view, limits, after, age, own_part, witness)
-            if ended != _GOES_ON:
-                break
-            choose(policy, view, work.controls)
-            for robot in range(robots):
-                if not legal(view, robot, work.controls[robot]):
-                    return cost, steps, False, stage, ILLEGAL
-            steps += 1
-        seen = _look(view, work.controls, work.seen, forced and age < 0, noise, seen, age)
-        for robot in range(robots):
-            place = location[robot]
-            if not tables.free or known[place] < 1.0:
-                cost += _interval_cost(view, place, stage + 1)
-            if tables.steady:
-                known[place] = 1.0 if work.seen[robot] == 0 else 0.0
-            level[place], since[place] = work.seen[robot], stage + 1
-        stage += 1
-    for place in range(size):
-        if not tables.free or known[place] < 1.0:
-            cost += _interval_cost(view, place, stage)
-    cut = ended == _CUT
-    if cut and limits.closed:
-        cost += tables.discounts[stage] * _closed_cost(view, limits)
-    return cost, steps, cut, stage, FINE
+    begin(work, start, origin)
+    return continued(policy, tables, limits, after, work, start, 0, 0.0, first, forced, noise)
 
 
 @shared
 def _keep_state(tables, work, belief, location, stage):
     """Put a trajectory's state into ``belief``, its start until now, and ``location``."""
-    view = View(stage, work.location, work.level, work.since, work.intact, belief, tables, work.numbers)
+    view = View(stage, work.location, work.level, work.since, work.intact, belief, tables, work.numbers, np.uint64(0))
     for place in range(belief.shape[0]):
         for k in range(belief.shape[1]):
             work.row[k] = probability(view, place, k)

@@ -27,6 +27,7 @@ class Tables(NamedTuple):
         discounts: :math:`\alpha^n`, ``[n]``.
         destinations: location after a robot's control, -1 where the move leaves the graph, ``[L, A]``.
         order: all locations by their distance from one, then by number, ``[L, L]``.
+        distances: moves from one location to another, ``[L, L]``.
         first_controls: the control that starts a shortest path, ``[L, L]``.
         first_moves: the lowest move at a location, or repair where there is none, ``[L]``.
         columns: the partition's columns, ``[L]``.
@@ -34,6 +35,8 @@ class Tables(NamedTuple):
         absorbing: whether level 0 is, so that there are terminal states.
         steady: whether, moreover, no other level leads to level 0.
         free: whether, moreover, level 0 costs nothing.
+        upward: whether levels never fall by themselves, higher ones cost no less, and none costs less than nothing.
+        least_cost: of a level.
         terminal_probability: :math:`\epsilon`.
         damage_threshold: of the partition.
         low: density bound of the partition.
@@ -47,6 +50,7 @@ class Tables(NamedTuple):
     discounts: NDArray[np.float64]
     destinations: NDArray[np.int64]
     order: NDArray[np.int64]
+    distances: NDArray[np.int64]
     first_controls: NDArray[np.int64]
     first_moves: NDArray[np.int64]
     columns: NDArray[np.float64]
@@ -54,6 +58,8 @@ class Tables(NamedTuple):
     absorbing: bool
     steady: bool
     free: bool
+    upward: bool
+    least_cost: float
     terminal_probability: float
     damage_threshold: float
     low: float
@@ -74,6 +80,7 @@ class View(NamedTuple):
         start: belief in which the trajectory started, ``[L, K]``.
         tables: the model.
         work: numbers for the twin's own use, which it finds as it left them in the same trajectory or in another one.
+        key: the trajectory's stream of random numbers, uint64.
     """
 
     stage: int
@@ -84,6 +91,7 @@ class View(NamedTuple):
     start: NDArray[np.float64]
     tables: Tables
     work: NDArray[np.float32]
+    key: np.uint64
 
 
 @inner

@@ -1,0 +1,147 @@
+r"""DESPOT: determinized sparse partially observable trees (Somani, Ye, Hsu & Lee 2013; Ye, Somani, Hsu & Lee 2017)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_pomdp.checks import check_choice, check_integer, check_number
+from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.modules.rollout import MAX_STEPS, MAX_TRAJECTORIES, Policy
+from torchrl_pomdp.modules.scalar import Roots
+from torchrl_pomdp.planners.tree_search import TreeSearch, grown
+
+__all__ = ["DESPOT"]
+
+# Nodes that a tree starts with, beside those of the root's children; and entries of its lists of scenarios for each.
+_NODES, _SHARES = 256, 8
+
+
+class DESPOT(TreeSearch):
+    r"""DESPOT: the tree of all controls and of the observations of K scenarios, searched best bound first.
+
+    A scenario is a stream of random numbers that gives, with a history, the next observation; the controls share it. Costs
+    are :math:`\hat g` under the belief of the history. At every node the base policy, simulated in the node's scenarios, bounds
+    the cost of the best policy from above, and ``bound`` from below. Explorations follow the control of the lowest lower
+    bound and the observation of the largest gap, and stop where the gap is a share ``gap`` of the root's. A policy tree is
+    charged ``regularisation`` for each of its nodes, so that what few scenarios suggest is not overrated. Where no tree is
+    better than the base policy, its control is chosen.
+
+    Args:
+        model: the belief model; it needs a scalar twin, as repair and tabular models have.
+        base_policy: default policy with a scalar twin; None: any legal control, all equally likely. It reads histories only.
+
+    Keyword Args:
+        simulations: explorations of a decision; fewer where the gap is closed; or
+        seconds: how long it takes; it answers with what it has.
+        scenarios: K.
+        depth: largest depth D of the tree; None: ``max_steps``.
+        regularisation: :math:`\lambda`, a cost, not negative.
+        gap: :math:`\xi`, in [0, 1).
+        bound: ``"relaxed"``: what is known of the model, for repair models that robots must travel (all damage is visible, and
+            repaired when a robot can be there); ``"trivial"``: that costs are not below the least one.
+        max_steps: stages after which simulations end; None: :attr:`BeliefModel.horizon`.
+        seed: seed of the scenarios. They depend on it and on the feature state alone.
+
+    Raises:
+        ImportError: if numba, which the extra ``fast`` installs, is missing.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if a number is out of range, not exactly one of ``simulations`` and ``seconds`` is given, or model or
+            policy have no scalar twin.
+        RuntimeError: when called, if a lower bound exceeds an upper one: the model's bound is wrong.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_pomdp.modules.repair import UrgencyRepair
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> problem = make_problem("linear20")
+        >>> planner = DESPOT(problem.model, UrgencyRepair(problem.model), simulations=20)
+        >>> planner(problem.start(torch.arange(2)))["q_factors"].shape
+        torch.Size([2, 3])
+    """
+
+    def __init__(
+        self,
+        model: BeliefModel,
+        base_policy: Policy | None = None,
+        *,
+        simulations: int | None = None,
+        seconds: float | None = None,
+        scenarios: int = 100,
+        depth: int | None = None,
+        regularisation: float = 0.0,
+        gap: float = 0.95,
+        bound: Literal["relaxed", "trivial"] = "relaxed",
+        max_steps: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(model, base_policy, simulations=simulations, seconds=seconds, max_steps=max_steps, seed=seed)
+        self.scenarios = check_integer("scenarios", scenarios, 1, MAX_TRAJECTORIES)
+        self.depth = check_integer("depth", self.max_steps if depth is None else depth, 1, MAX_STEPS)
+        self.regularisation = check_number("regularisation", regularisation, "[0, inf)")
+        self.gap = check_number("gap", gap, "[0, 1)")
+        self.bound = check_choice("bound", bound, ("relaxed", "trivial"))
+
+    def _decide(self, roots: Roots, number: int, q: NDArray[np.float64]) -> int:
+        from torchrl_pomdp.planners.despot_loop import CROSSED, FULL, ILLEGAL, Options, explore
+
+        q[:] = np.inf
+        state, tree, done, steps = roots.state(number), self._tree(roots.width), 0, 0
+        options = Options(
+            self.scenarios, self.depth, self.regularisation, self.gap, self.model.discount, self.bound == "relaxed"
+        )
+        memory = np.empty(self.scenarios, np.int64)
+        for more in self.budget.stretches():
+            last = done + more
+            while done < last:
+                args = roots.model, roots.policy, state, tree, memory, roots.keys[number], done, last - done, options
+                done, made, how = self.call(explore, *args, roots.least, q)
+                self.check_legal(how != ILLEGAL)
+                if how == CROSSED:
+                    raise RuntimeError("a lower bound of the cost exceeds an upper one: the relaxation of the model is wrong")
+                steps += made
+                if how == FULL:
+                    tree = self._grown(tree)
+        return steps
+
+    def _grown(self, tree: Any) -> Any:
+        """The same tree with room for twice as much."""
+        return type(tree)(tree.size, *(grown(each) for each in tree[1:]))
+
+    def _tree(self, width: int) -> Any:
+        from torchrl_pomdp.planners.despot_loop import Despot
+
+        controls = self.model.num_controls
+        nodes = _NODES + self.scenarios * controls
+        whole, real, flags = (_zeros(nodes, kind) for kind in (np.int64, np.float64, np.bool_))
+        return Despot(
+            size=np.zeros(2, np.int64),
+            rows=real(width),
+            seen=np.zeros(nodes, np.uint64),
+            parents=whole(),
+            depths=whole(),
+            first=whole(),
+            counts=whole(),
+            members=np.zeros(_SHARES * nodes, np.int64),
+            lower=real(),
+            upper=real(),
+            base=real(),
+            gaps=real(),
+            ended=flags(),
+            open=flags(),
+            legal=flags(controls),
+            costs=real(controls),
+            children=whole(controls),
+            branches=whole(controls),
+        )
+
+
+def _zeros(nodes: int, kind: Any) -> Any:
+    """Makes arrays of zeros, one row for each node."""
+
+    def make(*columns: int) -> NDArray[Any]:
+        return np.zeros((nodes, *columns), kind)
+
+    return make

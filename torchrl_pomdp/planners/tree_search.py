@@ -1,0 +1,184 @@
+"""What searches of a tree of histories have in common: roots side by side on the cores, within a budget."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from importlib.util import find_spec
+from threading import Lock
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
+from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy
+from torchrl_pomdp.modules.scalar import Limited, Roots, ScalarEngine, local_engine, scalar_engine
+from torchrl_pomdp.modules.threads import map_threads
+
+__all__ = ["Budget", "TreeSearch"]
+
+# Most simulations of a decision.
+_MOST = 10**9
+
+
+class Budget:
+    """How long a decision may search: a number of simulations, or seconds.
+
+    Args:
+        simulations: their number, or None.
+        seconds: the time, or None.
+
+    Raises:
+        TypeError: if one is of the wrong kind.
+        ValueError: if not exactly one is given, or it is not positive.
+
+    Examples:
+        >>> list(Budget(100, None).stretches())
+        [100]
+        >>> Budget(None, None)
+        Traceback (most recent call last):
+        ValueError: simulations or seconds must be given, and not both; got None and None
+    """
+
+    def __init__(self, simulations: int | None, seconds: float | None) -> None:
+        if (simulations is None) == (seconds is None):
+            raise ValueError(f"simulations or seconds must be given, and not both; got {simulations} and {seconds}")
+        self.simulations = None if simulations is None else check_integer("simulations", simulations, 1, _MOST)
+        self.seconds = None if seconds is None else check_number("seconds", seconds, "(0, inf)")
+
+    def stretches(self) -> Iterator[int]:
+        """Numbers of simulations to go on with, as many at a time as the time allows; the first one always."""
+        if self.seconds is None:
+            yield int(self.simulations or 0)
+            return
+        begin, done, size = perf_counter(), 0, 1
+        while done < _MOST:
+            yield size
+            done += size
+            elapsed = perf_counter() - begin
+            # Later ones may take longer than those so far.
+            fitting = done * (self.seconds / elapsed - 1.0) / 2
+            if fitting < 1.0 and elapsed >= self.seconds * (1.0 - 0.5 / done):
+                return
+            size = max(1, int(min(fitting, 4.0 * done)))
+
+
+class TreeSearch(TensorDictModuleBase):
+    """Base of the searches: feature states ``[*B]`` in, ``"action"`` and ``"q_factors"`` out, like ``RolloutPolicy``.
+
+    Args:
+        model: the belief model; it needs a scalar twin.
+        base_policy: policy with a scalar twin; None: any legal control, all equally likely.
+
+    Keyword Args:
+        simulations: how many a decision makes; or
+        seconds: how long it takes.
+        max_steps: stages after which simulations end; None: :attr:`BeliefModel.horizon`.
+        seed: seed of the simulations.
+
+    Raises:
+        ImportError: if numba is not installed.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if a number is out of range, or model or policy have no scalar twin.
+    """
+
+    out_keys = ["action", "q_factors"]
+
+    def __init__(
+        self,
+        model: BeliefModel,
+        base_policy: Policy | None,
+        *,
+        simulations: int | None,
+        seconds: float | None,
+        max_steps: int | None,
+        seed: int,
+    ) -> None:
+        super().__init__()
+        self.model = check_instance("model", model, BeliefModel)
+        self.in_keys = list(model.state_keys)
+        self.base_policy = None if base_policy is None else check_callable("base_policy", base_policy)
+        self.budget = Budget(simulations, seconds)
+        self.max_steps = check_integer("max_steps", model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
+        self.seed = check_integer("seed", seed)
+        self.simulated_steps = 0
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """What a copy makes for itself."""
+        self._lock, self._loops, self.engine = Lock(), None, self._engine()
+
+    def _engine(self) -> ScalarEngine:
+        if find_spec("numba") is None:
+            raise ImportError(f"{type(self).__name__} needs numba: pip install 'torchrl-pomdp[fast]'")
+        limits = Limited(self.max_steps, None, None)
+        if self.base_policy is None:
+            engine = local_engine((), self.model, limits)
+        else:
+            engine = scalar_engine(self.base_policy, self.model, limits)
+        if engine is None:
+            what = type(self.model).__name__ if self.base_policy is None else type(self.base_policy).__name__
+            name = "model" if self.base_policy is None else "base_policy"
+            raise ValueError(
+                f"{name} must have a scalar twin for a search on {self.model.device} of {type(self.model).__name__}, got {what}"
+            )
+        return engine
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"action"``, int64 ``[*B]``, and ``"q_factors"``, ``[*B, U]``, infinite where a control was not tried."""
+        self.model.check_state(tensordict)
+        roots = self.engine.roots(tensordict, self.seed)
+        shape = tensordict.batch_size
+        q = np.empty((shape.numel(), self.model.num_controls))
+        threads = torch.get_num_threads()
+
+        def decide(number: int) -> int:
+            return self._decide(roots, number, q[number])
+
+        steps = map_threads(decide, range(len(q)), threads) if len(q) else []
+        with self._lock:
+            self.simulated_steps += sum(steps)
+        result = torch.from_numpy(q).to(self.model.dtype).view(*shape, self.model.num_controls)
+        # Where nothing follows, whatever is legal is as good.
+        nothing = torch.isinf(result).all(-1, keepdim=True) & self.model.action_mask(tensordict)
+        result = result.masked_fill(nothing, 0.0)
+        tensordict.set("q_factors", result)
+        return tensordict.set("action", result.argmin(-1))
+
+    @abstractmethod
+    def _decide(self, roots: Roots, number: int, q: NDArray[np.float64]) -> int:
+        """Search from a root; puts its Q-factors into ``q`` ``[U]``; returns the number of simulated steps."""
+
+    def call(self, function: Any, *args: Any) -> Any:
+        """Call a compiled loop; its arguments have the same types and memory layouts at every call."""
+        if self._loops is None:
+            from torchrl_pomdp.scalar.compiling import Loops
+
+            self._loops = Loops()
+        return self._loops(function, *args)
+
+    def check_legal(self, well: bool) -> None:
+        """Raise unless all was well with the base policy's controls."""
+        if not well:
+            raise ValueError("base_policy chose an illegal control in a simulation; its scalar twin must choose a legal one")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the lock and the compiled loop: a copy makes its own."""
+        return {key: value for key, value in self.__dict__.items() if key not in {"_lock", "_loops", "engine"}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The inverse of :meth:`__getstate__`."""
+        super().__setstate__(state)
+        self._prepare()
+
+
+def grown(array: NDArray[Any]) -> NDArray[Any]:
+    """Twice as many rows, the new ones zero."""
+    return np.concatenate([array, np.zeros_like(array)])
