@@ -67,6 +67,7 @@ REPORTS = {
         policy=at_once(a_policy()),
         start=at_once(a_start()),
         num_states=(2, integers(1)),
+        first=(0, integers(0)),
         seed=(0, integers()),
         max_steps=(3, integers(1)),
         terminal_cost=at_once((ZeroCost(), terminal_costs())),

@@ -17,18 +17,31 @@ from pathlib import Path
 
 import pytest
 from _hostile import Hostile
+from _refusals_exact import EXACT
 from _refusals_planning import ENVS, MODULES
 from _refusals_problems import PROBLEMS
 from _refusals_results import FILES, REPORTS
 from _refusals_training import COLLECTORS, TRAINERS
+from _refusals_world import WORLDS
 from _valid import Case
 
-CASES: dict[str, Callable[[Path], Case]] = {**ENVS, **MODULES, **PROBLEMS, **COLLECTORS, **TRAINERS, **REPORTS, **FILES}
+CASES: dict[str, Callable[[Path], Case]] = {
+    **ENVS,
+    **WORLDS,
+    **MODULES,
+    **PROBLEMS,
+    **COLLECTORS,
+    **TRAINERS,
+    **REPORTS,
+    **FILES,
+}
+CASES |= EXACT
 
 PUBLIC = (
     *("envs", "envs.repair", "modules", "modules.repair", "problems"),
     *("collectors", "objectives", "trainers", "trainers.run"),
     *("controller", "evaluation", "noise", "report", "reproduce", "files", "checks", "tensor_checks", "identity"),
+    *("planners", "bounds"),
 )
 
 # What is not tried, and why.
@@ -37,7 +50,7 @@ EXEMPT = {
     "tables and constants": "*.PRESETS *.REPAIR *.ALGORITHMS *.BASE_POLICIES *.EXPERIMENTS *.OPTIMA *.PUBLISHED *_SEED",
     "abstract, tried by what they are bases of": "envs.Partition modules.Encoder modules.ClosedFormCost modules.Truncation",
     "made by the library, not by its users": "*.Comparison *.Estimate *.Iteration *.PartRecord *.Effort *.DamagedFileError "
-    "*.PartitionReport *.Decision",
+    "*.PartitionReport *.Decision *.Interval *.Solution *.ErrorBounds",
     "run at every belief step, on what was checked before": "noise.fold noise.uniform noise.fingerprint noise.permuted",
     "of any object": "identity.*",
 }

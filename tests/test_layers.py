@@ -16,11 +16,12 @@ ROOMS = ("torchrl_pomdp.envs.repair", "torchrl_pomdp.modules.repair")
 KNOW_PIPELINES = {"problems/repair.py", "reproduce.py", "cli.py", "commands.py"}
 # What must not be imported from where; what lies beside these packages is free.
 ABOVE = {
-    "envs": {"modules", "problems", "collectors", "objectives", "trainers"},
-    "modules": {"problems", "collectors", "objectives", "trainers"},
-    "problems": {"collectors", "objectives", "trainers"},
-    "collectors": {"objectives", "trainers"},
-    "objectives": {"collectors", "trainers"},
+    "envs": {"modules", "problems", "collectors", "objectives", "planners", "trainers"},
+    "modules": {"problems", "collectors", "objectives", "planners", "trainers"},
+    "problems": {"collectors", "objectives", "planners", "trainers"},
+    "collectors": {"objectives", "planners", "trainers"},
+    "objectives": {"collectors", "planners", "trainers"},
+    "planners": {"problems", "collectors", "objectives", "trainers"},
     "trainers": set(),
 }
 

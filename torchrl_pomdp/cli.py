@@ -1,4 +1,4 @@
-"""The command ``torchrl-pomdp``: train policies, evaluate them, reproduce the paper's experiments, list the problems.
+"""The command ``torchrl-pomdp``: train, evaluate and compare policies, reproduce the paper's experiments, list the problems.
 
 Nothing that takes long to import is imported before the arguments are read.
 """
@@ -80,6 +80,35 @@ class Evaluate:
 
 
 @dataclass(frozen=True)
+class Compare:
+    """Compare all methods on a problem: base policies, rollout, a trained policy, POMCP, DESPOT and PPO; the same command goes
+    on with an interrupted comparison.
+    """
+
+    problem: tyro.conf.Positional[str]
+    """The problem, as for the command train."""
+
+    checkpoint: Path | None = None
+    """A trained policy of the problem; with it come online rollout on top of it, and PPO with as many belief steps as are
+    written in the folder of its run."""
+
+    states: int = 100
+    """Start states."""
+
+    seconds: float = 0.1
+    """Time of each decision of the methods that plan online."""
+
+    seed: int = EVALUATION_SEED
+    """Seed of start states and noise."""
+
+    runs: Path = Path("runs")
+    """Folder of the comparison's own folder."""
+
+    out: Path = Path("results")
+    """Folder of table, figures and numbers."""
+
+
+@dataclass(frozen=True)
 class Reproduce:
     """Carry out one of the paper's experiments; the same command goes on with an interrupted one."""
 
@@ -125,10 +154,11 @@ def main(args: list[str] | None = None) -> int:
     choices = (
         Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+        | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
         | Annotated[Problems, tyro.conf.subcommand("problems")]
     )
-    command: Train | Evaluate | Reproduce | Problems = tyro.cli(choices, prog="torchrl-pomdp", args=args)
+    command: Train | Evaluate | Compare | Reproduce | Problems = tyro.cli(choices, prog="torchrl-pomdp", args=args)
     from torchrl import logger
 
     from torchrl_pomdp import commands
@@ -139,11 +169,13 @@ def main(args: list[str] | None = None) -> int:
             commands.train(command)
         elif isinstance(command, Evaluate):
             commands.evaluate(command)
+        elif isinstance(command, Compare):
+            commands.compare(command)
         elif isinstance(command, Reproduce):
             commands.reproduce(command)
         else:
             commands.problems()
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, ImportError) as error:
         print(f"torchrl-pomdp: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -13,26 +14,27 @@ from torchrl_pomdp.checks import check_integer, check_seed
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
 from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.envs.repair import RepairModel, trajectory_figure
-from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.files import check_folder, write_json
+from torchrl_pomdp.evaluation import Comparison, discounted_costs
+from torchrl_pomdp.evaluation import compare as compare_costs
+from torchrl_pomdp.files import check_folder, read_text, write_bytes, write_json
 from torchrl_pomdp.modules import Policy
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems import PRESETS, Problem, make_problem
 from torchrl_pomdp.problems.find import find_problem
 from torchrl_pomdp.provenance import provenance
-from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, ratio_texts, table
+from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, peer_figure, peer_table, ratio_texts, table
 from torchrl_pomdp.reproduce import EXPERIMENTS
 from torchrl_pomdp.reproduce import reproduce as reproduce_experiment
 from torchrl_pomdp.tensor_checks import check_device
-from torchrl_pomdp.trainers import load_checkpoint, r_nt
+from torchrl_pomdp.trainers import compare_peers, load_checkpoint, r_nt
 from torchrl_pomdp.trainers.run import TrainingRun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from torchrl_pomdp.cli import Evaluate, Reproduce, Train
+    from torchrl_pomdp.cli import Compare, Evaluate, Reproduce, Train
 
-__all__ = ["evaluate", "problems", "reproduce", "train"]
+__all__ = ["compare", "evaluate", "problems", "reproduce", "train"]
 
 
 def train(command: Train) -> None:
@@ -103,7 +105,7 @@ def evaluate(command: Evaluate) -> None:
         for name, policy in policies.items()
     }
     print(f"{problem.name}: {problem.model.describe()}; {command.states} start states, seed {command.seed}\n")
-    print(table([Result(name, compare(cost, costs[problem.baseline])) for name, cost in costs.items()]))
+    print(table([Result(name, compare_costs(cost, costs[problem.baseline])) for name, cost in costs.items()]))
 
 
 def _named_policy(command: Evaluate, device: torch.device) -> tuple[Problem, Policy, str]:
@@ -113,6 +115,49 @@ def _named_policy(command: Evaluate, device: torch.device) -> tuple[Problem, Pol
         return given, given.base_policies[command.policy], command.policy
     checkpoint = load_checkpoint(command.policy, problem=given, device=device)
     return checkpoint.problem, checkpoint.policy, checkpoint.name
+
+
+def compare(command: Compare) -> None:
+    """Compare all methods; print the table, write it with its numbers, then draw its pictures."""
+    given = None if command.checkpoint is None else load_checkpoint(command.checkpoint, problem=_own(command.problem))
+    problem = find_problem(command.problem, torch.device("cpu"))
+    name = f"compare-{problem.name}-{command.seconds:g}s"
+    runs, out = check_folder("runs", command.runs), check_folder("out", command.out)
+    outcomes = compare_peers(
+        problem,
+        runs / name,
+        checkpoint=given,
+        ppo_steps=None if command.checkpoint is None else _simulated_steps(command.checkpoint.parent),
+        states=command.states,
+        seconds=command.seconds,
+        seed=command.seed,
+        report=lambda method, outcome: _tell(problem.baseline, method, outcome.comparison),
+        progress=True,
+    )
+    text = f"{problem.name}, {command.states} start states, {command.seconds:g} s a decision\n\n{peer_table(outcomes)}"
+    content = {"command": {**asdict(command), **{key: str(getattr(command, key)) for key in ("checkpoint", "runs", "out")}}}
+    content |= {"provenance": provenance(), "outcomes": {method: each.to_dict() for method, each in outcomes.items()}}
+    write_json(out / f"{name}.json", content)
+    write_bytes(out / f"{name}.md", f"{text}\n".encode())
+    print(f"\n{text}\n", flush=True)
+    results = [Result(method, outcome.comparison) for method, outcome in outcomes.items()]
+    title = f"{problem.name}, {command.states} start states"
+    pictures = {out / f"{name}-time.png": partial(peer_figure, outcomes, title)}
+    print(draw(pictures | {out / f"{name}.png": partial(cost_figure, results, f"{title}\nbelow: against {problem.baseline}")}))
+
+
+def _own(name: str) -> Problem | None:
+    """The problem that a checkpoint does not know by itself: one of one's own code."""
+    return find_problem(name, torch.device("cpu")) if ":" in name else None
+
+
+def _simulated_steps(folder: Path) -> int | None:
+    """Belief steps that the labels of a run took; None where the folder does not say."""
+    path = folder / "iterations.json"
+    if not path.is_file():
+        return None
+    iterations = json.loads(read_text(path))
+    return sum(part["simulated_steps"] for iteration in iterations for part in iteration["parts"].values())
 
 
 def reproduce(command: Reproduce) -> None:

@@ -13,7 +13,7 @@ from torchrl_pomdp.checks import check_callable, check_flag, check_instance, che
 from torchrl_pomdp.config import MAX_STATES
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
-from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
+from torchrl_pomdp.modules.scalar import Limited, SearchEngine, scalar_engine
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.tensor_checks import check_tensor
@@ -67,6 +67,7 @@ def discounted_costs(
     start: StateGenerator,
     *,
     num_states: int = 1000,
+    first: int = 0,
     seed: int = 0,
     max_steps: int | None = None,
     terminal_cost: TerminalCost | None = None,
@@ -84,6 +85,7 @@ def discounted_costs(
 
     Keyword Args:
         num_states: number of start states.
+        first: number i of the first one.
         seed: seed of the start states and of the noise.
         max_steps: stages after which a trajectory is cut; None: as the discount asks for, see :attr:`BeliefModel.horizon`.
         terminal_cost: what a cut adds, see :class:`TruncatedRollout`.
@@ -110,7 +112,8 @@ def discounted_costs(
     check_callable("start", start)
     num_states = check_integer("num_states", num_states, 1, MAX_STATES)
     seed = check_integer("seed", seed)
-    keys = seed_keys(seed, torch.arange(num_states, device=model.device))
+    first = check_integer("first", first, 0, MAX_STATES)
+    keys = seed_keys(seed, torch.arange(first, first + num_states, device=model.device))
     with progress_bar(None, "step", check_text("name", name), check_flag("progress", progress)) as bar:
         cost = TruncatedRollout(model, _Watched(policy, bar), max_steps=max_steps, terminal_cost=terminal_cost)
         costs = cost(model.drawn(start, fold(keys, 0), "start"), fold(keys, 1))
@@ -126,7 +129,7 @@ class _Watched:
         self.policy, self.bar = policy, bar
         self.in_keys = getattr(policy, "in_keys", ())
 
-    def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> SearchEngine | None:
         return scalar_engine(self.policy, model, limits)
 
     def __call__(self, y: TensorDictBase) -> TensorDictBase:

@@ -6,6 +6,9 @@ from torchrl_pomdp.envs.generators import FixedBelief, InPart, Mixture, RandomPl
 from torchrl_pomdp.envs.partition import FunctionPartition, Partition, SinglePart
 from torchrl_pomdp.envs.pomdp_file import parse_pomdp, read_pomdp, write_pomdp
 from torchrl_pomdp.envs.tabular import TabularModel
+from torchrl_pomdp.envs.track_belief import TrackBelief
+from torchrl_pomdp.envs.world import World
+from torchrl_pomdp.envs.world_env import WorldEnv
 
 __all__ = [
     "BeliefEnv",
@@ -19,6 +22,9 @@ __all__ = [
     "SinglePart",
     "StateGenerator",
     "TabularModel",
+    "TrackBelief",
+    "World",
+    "WorldEnv",
     "parse_pomdp",
     "read_pomdp",
     "write_pomdp",

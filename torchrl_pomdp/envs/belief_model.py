@@ -10,7 +10,7 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -18,11 +18,15 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Categorical, Composite
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_number, check_sequence, shown
+from torchrl_pomdp.envs.entries import check_state_entries
 from torchrl_pomdp.envs.names import name_of, number_of
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.noise import fingerprint
-from torchrl_pomdp.tensor_checks import bounds_text, check_keys, within
+from torchrl_pomdp.tensor_checks import check_keys
+
+if TYPE_CHECKING:
+    from torchrl_pomdp.envs.world import World
 
 __all__ = ["INSIGNIFICANT", "BeliefModel", "StateGenerator", "generated"]
 
@@ -44,7 +48,7 @@ class BeliefModel(nn.Module, ABC):
     ``y`` carries, so nothing is computed that nobody reads.
 
     Subclasses define :meth:`state_spec`, :meth:`action_mask`, :meth:`expected_cost`, :meth:`observation_probs` and
-    :meth:`estimator`; they may override :meth:`advance` to be faster.
+    :meth:`estimator`; they may override :meth:`advance` to be faster, and :meth:`world` to be simulated.
 
     Attributes:
         state_keys: names of the core entries.
@@ -110,6 +114,17 @@ class BeliefModel(nn.Module, ABC):
         other._modules = dict(self._modules)
         other.partition = partition
         return other
+
+    def unrestricted(self) -> BeliefModel:
+        """The same model where controls that are pointless, but can be carried out, are legal too; most have none.
+
+        Examples:
+            >>> from torchrl_pomdp.problems import make_problem
+            >>> problem = make_problem("tiger")
+            >>> problem.model.unrestricted() is problem.model
+            True
+        """
+        return self
 
     @property
     def horizon(self) -> int:
@@ -250,21 +265,7 @@ class BeliefModel(nn.Module, ABC):
             TypeError: if ``y`` is not a TensorDict or an entry has the wrong dtype.
             ValueError: if an entry is missing, has the wrong shape, or lies outside its bounds.
         """
-        check_instance("y", y, TensorDictBase)
-        for key, leaf in self.state_spec().items():
-            value = y.get(key, None)
-            if value is None:
-                raise ValueError(f"y lacks the entry {key!r}; a feature state needs {list(self.state_keys)}")
-            shape = (*y.batch_size, *leaf.shape)
-            if value.shape != shape:
-                raise ValueError(
-                    f"entry {key!r} of y has shape {tuple(value.shape)}, expected {shape}: "
-                    f"the batch {tuple(y.batch_size)} followed by the entry's own shape"
-                )
-            if value.dtype != leaf.dtype:
-                raise TypeError(f"entry {key!r} of y has dtype {value.dtype}, expected {leaf.dtype}")
-            if value.numel() and not within(leaf, value):
-                raise ValueError(f"entry {key!r} of y holds values outside its bounds: expected {bounds_text(leaf)}")
+        check_state_entries("y", y, self.state_spec(), "a feature state")
 
     def check_controls(self, y: TensorDictBase, u: Tensor) -> None:
         """Raise unless ``u`` are legal controls in ``y``; its ``"action_mask"`` is believed if it has one.
@@ -335,6 +336,19 @@ class BeliefModel(nn.Module, ABC):
                 result.set(key, leaf.to(self.dtype))
         self.check_state(result)
         return result
+
+    def world(self) -> World:
+        """The hidden states that the beliefs are about, for :class:`~torchrl_pomdp.envs.WorldEnv`; not every model has them.
+
+        Raises:
+            TypeError: if this model has none.
+
+        Examples:
+            >>> from torchrl_pomdp.problems import make_problem
+            >>> [key for key in make_problem("linear20").model.world().hidden_spec().keys()]
+            ['level', 'location']
+        """
+        raise TypeError(f"model has no hidden states: {type(self).__name__} must override world(), giving a World")
 
     # ---- what a real robot does and reports, see torchrl_pomdp.controller ---------------------------------------------
 

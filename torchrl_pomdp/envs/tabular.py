@@ -16,6 +16,7 @@ from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.envs.tables import table
+from torchrl_pomdp.envs.world import World
 from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype, check_tensor
 
 __all__ = ["TabularModel"]
@@ -236,6 +237,13 @@ class TabularModel(BeliefModel):
         predicted, control = self._predicted(y, u), u.reshape(-1)
         z = inverse_cdf(self._sees.mix(predicted, control), noise[..., 0].reshape(-1))
         return self.expected_cost(y, u), self._successor(y, *self._weigh(predicted, control, z))
+
+    def world(self) -> World:
+        """The states."""
+        # Not at the top: the world knows the model.
+        from torchrl_pomdp.envs.tabular_world import TabularWorld
+
+        return TabularWorld(self)
 
     # ---- kernels on N rows -----------------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@ r"""Base policies :math:`\mu` of any problem (paper, Section III)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,7 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_text
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.tabular import TabularModel
 from torchrl_pomdp.modules.rollout import Policy, controls_of
+from torchrl_pomdp.modules.scalar import Limited, SearchEngine, offer_engines
 from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["Myopic", "as_policy"]
@@ -38,6 +41,14 @@ class Myopic(TensorDictModuleBase):
         super().__init__()
         self.model = check_instance("model", model, BeliefModel)
         self.in_keys = list(model.state_keys)
+
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> SearchEngine | None:
+        """Compiled searches of tabular models, see :class:`~torchrl_pomdp.modules.scalar.SearchEngine`."""
+        from torchrl_pomdp.modules.tabular import searches, tabular_engine
+
+        # The same model with another partition has the same tables.
+        same = isinstance(self.model, TabularModel) and isinstance(model, TabularModel) and self.model.cost is model.cost
+        return tabular_engine(searches.myopic, (), model, limits) if same else None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``."""
@@ -88,3 +99,14 @@ def as_policy(policy: Any, model: BeliefModel, name: str = "policy") -> TensorDi
     if isinstance(policy, type):
         raise TypeError(f"{check_text('name', name)} must be a policy, got the class {policy.__name__}: make one of it")
     return _CallablePolicy(check_callable(check_text("name", name), policy), model)
+
+
+def _tabular_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -> SearchEngine | None:
+    from torchrl_pomdp.modules.tabular import searches, tabular_engine
+
+    if not policies:
+        return tabular_engine(searches.random, (), model, limits)
+    return policies[0].scalar_engine(model, limits) if len(policies) == 1 and type(policies[0]) is Myopic else None
+
+
+offer_engines(TabularModel, _tabular_engine)

@@ -17,7 +17,7 @@ from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.modules.encoders import Encoder, transformed
 from torchrl_pomdp.modules.rowwise import RowLinear, rowwise
-from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, local_engine
+from torchrl_pomdp.modules.scalar import Limited, SearchEngine, local_engine
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
 from torchrl_pomdp.tensor_checks import check_entries
 
@@ -61,7 +61,7 @@ class LocalNetwork(TensorDictModuleBase):
         entries = evaluate_networks([self], flat, rows, [rows.numel()])
         return tensordict.update(entries.reshape(tensordict.batch_size))
 
-    def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> SearchEngine | None:
         """Compiled simulations, see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`."""
         return local_engine([self], model, limits)
 

@@ -14,7 +14,7 @@ from torchrl_pomdp.checks import check_instance, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import take_rows
 from torchrl_pomdp.modules.networks import LocalNetwork, evaluate_networks
-from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, local_engine
+from torchrl_pomdp.modules.scalar import Limited, SearchEngine, local_engine
 from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["PartitionedPolicy", "PartitionedValue"]
@@ -120,7 +120,7 @@ class PartitionedPolicy(_Partitioned):
     def __init__(self, policies: Sequence[TensorDictModuleBase]) -> None:
         super().__init__("policies", policies)
 
-    def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> SearchEngine | None:
         """Compiled simulations, see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`."""
         return local_engine(list(self.policies), model, limits)
 

@@ -210,7 +210,8 @@ class TruncatedRollout(nn.Module):
 
     def _make_engine(self) -> None:
         limits = Limited(self.max_steps, self.truncation, self.terminal_cost)
-        self.scalar = scalar_engine(self.base_policy, self.model, limits)
+        engine = scalar_engine(self.base_policy, self.model, limits)
+        self.scalar = engine if isinstance(engine, ScalarEngine) else None
         self._members = self._policy_members()
 
     def _policy_members(self) -> tuple[nn.Module, ...]:

@@ -17,7 +17,17 @@ from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.truncation import Truncation
 
-__all__ = ["Allocation", "Cut", "Limited", "Roots", "ScalarEngine", "local_engine", "offer_engines", "scalar_engine"]
+__all__ = [
+    "Allocation",
+    "Cut",
+    "Limited",
+    "Roots",
+    "ScalarEngine",
+    "SearchEngine",
+    "local_engine",
+    "offer_engines",
+    "scalar_engine",
+]
 
 
 class Cut(NamedTuple):
@@ -97,7 +107,20 @@ class Limited(NamedTuple):
     terminal_cost: Any
 
 
-class ScalarEngine(ABC):
+class SearchEngine(ABC):
+    """A policy and its model in compiled searches."""
+
+    @abstractmethod
+    def roots(self, y: TensorDictBase, seed: int) -> Roots:
+        """States ``[*B]``, checked, as roots of searches.
+
+        Args:
+            y: feature states.
+            seed: seed of their random numbers.
+        """
+
+
+class ScalarEngine(SearchEngine):
     """Simulates the trajectories of a policy with a scalar twin; means the same as the tensors' way.
 
     Attributes:
@@ -136,17 +159,8 @@ class ScalarEngine(ABC):
             ValueError: likewise, or if the policy's twin chooses an illegal control.
         """
 
-    @abstractmethod
-    def roots(self, y: TensorDictBase, seed: int) -> Roots:
-        """States ``[*B]``, checked, as roots of searches.
 
-        Args:
-            y: feature states.
-            seed: seed of their random numbers.
-        """
-
-
-LocalEngines = Callable[[Sequence[Any], BeliefModel, Limited], ScalarEngine | None]
+LocalEngines = Callable[[Sequence[Any], BeliefModel, Limited], SearchEngine | None]
 _OFFERED: dict[type[BeliefModel], LocalEngines] = {}
 
 
@@ -160,7 +174,7 @@ def offer_engines(kind: type[BeliefModel], make: LocalEngines) -> None:
     _OFFERED[kind] = make
 
 
-def local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+def local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -> SearchEngine | None:
     """Compiled simulations of local policies, one for each part; None where there are none for the model, or for them.
 
     Args:
@@ -174,8 +188,8 @@ def local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -
     return None if make is None else make(policies, model, limits)
 
 
-def scalar_engine(policy: Any, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
-    """Compiled simulations of a policy; None where policy or model offer none, on an accelerator, or without numba.
+def scalar_engine(policy: Any, model: BeliefModel, limits: Limited) -> SearchEngine | None:
+    """Compiled simulations of a policy, or searches alone; None on an accelerator, without numba, or where none are offered.
 
     A policy offers them by a method ``scalar_engine(model, limits)``; one that overrides ``forward`` alone does not.
 
@@ -186,7 +200,7 @@ def scalar_engine(policy: Any, model: BeliefModel, limits: Limited) -> ScalarEng
     """
     if not _has_twin(policy) or model.device.type != "cpu" or find_spec("numba") is None:
         return None
-    engine: ScalarEngine | None = policy.scalar_engine(model, limits)
+    engine: SearchEngine | None = policy.scalar_engine(model, limits)
     return engine
 
 

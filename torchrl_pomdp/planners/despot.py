@@ -6,8 +6,10 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
 
-from torchrl_pomdp.checks import check_choice, check_integer, check_number
+from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.rollout import MAX_STEPS, MAX_TRAJECTORIES, Policy
 from torchrl_pomdp.modules.scalar import Roots
@@ -62,6 +64,8 @@ class DESPOT(TreeSearch):
         torch.Size([2, 3])
     """
 
+    _extra = 2
+
     def __init__(
         self,
         model: BeliefModel,
@@ -84,10 +88,22 @@ class DESPOT(TreeSearch):
         self.gap = check_number("gap", gap, "[0, 1)")
         self.bound = check_choice("bound", bound, ("relaxed", "trivial"))
 
-    def _decide(self, roots: Roots, number: int, q: NDArray[np.float64]) -> int:
+    def bounds(self, y: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Bounds of the cost of the best policy tree over the scenarios of states ``[*B]``, with its regularisation: ``[*B]``.
+
+        Args:
+            y: feature states.
+
+        Returns:
+            lower and upper bound; the latter is the cost of a policy that has been found. They differ from those of the best
+            policy's expected cost as the mean over K scenarios does.
+        """
+        found = self._search(check_instance("y", y, TensorDictBase))
+        return found[..., -2], found[..., -1]
+
+    def _decide(self, roots: Roots, number: int, found: NDArray[np.float64]) -> int:
         from torchrl_pomdp.planners.despot_loop import CROSSED, FULL, ILLEGAL, Options, explore
 
-        q[:] = np.inf
         state, tree, done, steps = roots.state(number), self._tree(roots.width), 0, 0
         options = Options(
             self.scenarios, self.depth, self.regularisation, self.gap, self.model.discount, self.bound == "relaxed"
@@ -97,13 +113,14 @@ class DESPOT(TreeSearch):
             last = done + more
             while done < last:
                 args = roots.model, roots.policy, state, tree, memory, roots.keys[number], done, last - done, options
-                done, made, how = self.call(explore, *args, roots.least, q)
+                done, made, how = self.call(explore, *args, roots.least, found[:-2])
                 self.check_legal(how != ILLEGAL)
                 if how == CROSSED:
                     raise RuntimeError("a lower bound of the cost exceeds an upper one: the relaxation of the model is wrong")
                 steps += made
                 if how == FULL:
                     tree = self._grown(tree)
+        found[-2:] = tree.lower[0], tree.upper[0]
         return steps
 
     def _grown(self, tree: Any) -> Any:

@@ -65,14 +65,14 @@ class POMCP(TreeSearch):
         *,
         simulations: int | None = None,
         seconds: float | None = None,
-        exploration: float = 0.05,
+        exploration: float = 0.2,
         max_steps: int | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__(model, base_policy, simulations=simulations, seconds=seconds, max_steps=max_steps, seed=seed)
         self.exploration = check_number("exploration", exploration, "[0, inf)")
 
-    def _decide(self, roots: Roots, number: int, q: NDArray[np.float64]) -> int:
+    def _decide(self, roots: Roots, number: int, found: NDArray[np.float64]) -> int:
         from torchrl_pomdp.planners.pomcp_loop import Path, search
 
         state, tree, done, steps = roots.state(number), self._tree(), 0, 0
@@ -89,16 +89,16 @@ class POMCP(TreeSearch):
                 steps += made
                 if done < last:
                     tree = self._grown(tree)
-        q[:] = np.where(tree.legal[0] & (tree.counts[0] > 0), tree.means[0], np.inf)
+        found[:] = np.where(tree.legal[0] & (tree.counts[0] > 0), tree.means[0], np.inf)
         return steps
 
     def _grown(self, tree: Any) -> Any:
         """The same tree with room for twice as many nodes."""
-        from torchrl_pomdp.planners.pomcp_loop import Tree, put_edges
+        from torchrl_pomdp.planners.pomcp_loop import put_edges
 
         size, *nodes, names, children = tree
         table = np.zeros(2 * len(names), np.uint64), np.full(2 * len(names), -1)
-        result = Tree(size, *(grown(each) for each in nodes), *table)
+        result = type(tree)(size, *(grown(each) for each in nodes), *table)
         self.call(put_edges, result, names, children)
         return result
 

@@ -14,11 +14,12 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy
-from torchrl_pomdp.modules.scalar import Limited, Roots, ScalarEngine, local_engine, scalar_engine
+from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine, local_engine, scalar_engine
 from torchrl_pomdp.modules.threads import map_threads
 
 __all__ = ["Budget", "TreeSearch"]
@@ -89,6 +90,8 @@ class TreeSearch(TensorDictModuleBase):
     """
 
     out_keys = ["action", "q_factors"]
+    # Numbers that a search finds beside the Q-factors.
+    _extra = 0
 
     def __init__(
         self,
@@ -112,9 +115,10 @@ class TreeSearch(TensorDictModuleBase):
 
     def _prepare(self) -> None:
         """What a copy makes for itself."""
-        self._lock, self._loops, self.engine = Lock(), None, self._engine()
+        self._lock, self.engine = Lock(), self._engine()
+        self._loops: Any = None
 
-    def _engine(self) -> ScalarEngine:
+    def _engine(self) -> SearchEngine:
         if find_spec("numba") is None:
             raise ImportError(f"{type(self).__name__} needs numba: pip install 'torchrl-pomdp[fast]'")
         limits = Limited(self.max_steps, None, None)
@@ -130,31 +134,30 @@ class TreeSearch(TensorDictModuleBase):
             )
         return engine
 
-    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``, and ``"q_factors"``, ``[*B, U]``, infinite where a control was not tried."""
-        self.model.check_state(tensordict)
-        roots = self.engine.roots(tensordict, self.seed)
-        shape = tensordict.batch_size
-        q = np.empty((shape.numel(), self.model.num_controls))
-        threads = torch.get_num_threads()
-
-        def decide(number: int) -> int:
-            return self._decide(roots, number, q[number])
-
-        steps = map_threads(decide, range(len(q)), threads) if len(q) else []
-        with self._lock:
-            self.simulated_steps += sum(steps)
-        result = torch.from_numpy(q).to(self.model.dtype).view(*shape, self.model.num_controls)
+        q = self._search(tensordict)[..., : self.model.num_controls]
         # Where nothing follows, whatever is legal is as good.
-        nothing = torch.isinf(result).all(-1, keepdim=True) & self.model.action_mask(tensordict)
-        result = result.masked_fill(nothing, 0.0)
-        tensordict.set("q_factors", result)
-        return tensordict.set("action", result.argmin(-1))
+        nothing = torch.isinf(q).all(-1, keepdim=True) & self.model.action_mask(tensordict)
+        q = q.masked_fill(nothing, 0.0)
+        return tensordict.set("q_factors", q).set("action", q.argmin(-1))
+
+    @torch.no_grad()
+    def _search(self, y: TensorDictBase) -> Tensor:
+        """What the searches from states ``[*B]`` have found, ``[*B, U + E]``."""
+        self.model.check_state(y)
+        roots = self.engine.roots(y, self.seed)
+        found = np.full((y.batch_size.numel(), self.model.num_controls + self._extra), np.inf)
+        numbers = range(len(found))
+        if len(found):
+            steps = map_threads(lambda i: self._decide(roots, i, found[i]), numbers, torch.get_num_threads())
+            with self._lock:
+                self.simulated_steps += sum(steps)
+        return torch.from_numpy(found).to(self.model.dtype).view(*y.batch_size, -1)
 
     @abstractmethod
-    def _decide(self, roots: Roots, number: int, q: NDArray[np.float64]) -> int:
-        """Search from a root; puts its Q-factors into ``q`` ``[U]``; returns the number of simulated steps."""
+    def _decide(self, roots: Roots, number: int, found: NDArray[np.float64]) -> int:
+        """Search from a root; puts Q-factors, and E numbers more, into ``found``; returns the number of simulated steps."""
 
     def call(self, function: Any, *args: Any) -> Any:
         """Call a compiled loop; its arguments have the same types and memory layouts at every call."""

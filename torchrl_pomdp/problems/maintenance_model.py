@@ -21,6 +21,7 @@ from torchrl_pomdp.checks import check_integer, check_number, check_sequence
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.envs.world import World
 from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype, check_tensor
 
 __all__ = ["INSPECT", "NOTHING", "REPLACE", "Component", "MaintenanceModel"]
@@ -232,6 +233,13 @@ class MaintenanceModel(BeliefModel):
     def observed(self, y: TensorDictBase, u: Tensor) -> Tensor:
         """The components, ``[*B, n]``: something is seen of each at every stage."""
         return torch.arange(self.num_components, device=self.device).expand(*y.batch_size, -1)
+
+    def world(self) -> World:
+        """The components' true levels."""
+        # Not at the top: the world knows the model.
+        from torchrl_pomdp.problems.maintenance_world import MaintenanceWorld
+
+        return MaintenanceWorld(self)
 
     # ---- kernels on planes [n, K, N] and components' controls [n, N] -------------------------------------------------
 

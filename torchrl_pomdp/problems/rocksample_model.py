@@ -18,6 +18,7 @@ from torchrl.data import Bounded, Categorical, Composite
 from torchrl_pomdp.checks import check_integer, check_sequence, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.envs.world import World
 from torchrl_pomdp.tensor_checks import check_device, check_dtype
 
 __all__ = ["EAST", "FIRST_CHECK", "HALVING_DISTANCE", "NORTH", "SAMPLE", "SOUTH", "WEST", "RockSample", "offsets"]
@@ -193,6 +194,13 @@ class RockSample(BeliefModel):
     def observed(self, y: TensorDictBase, u: Tensor) -> Tensor:
         """1 + the rock that is checked, 0 for controls that see nothing, int64 ``[*B, 1]``."""
         return (u - FIRST_CHECK + 1).clamp_min(0).unsqueeze(-1)
+
+    def world(self) -> World:
+        """Which rocks are good."""
+        # Not at the top: the world knows the model.
+        from torchrl_pomdp.problems.rocksample_world import RockWorld
+
+        return RockWorld(self)
 
     def _concerned(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The pair of cell and control, the rock that it concerns (the first for none), and P(that rock is good), ``[*B]``."""

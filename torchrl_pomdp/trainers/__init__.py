@@ -4,6 +4,7 @@ from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.architecture import make_networks, make_values
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from torchrl_pomdp.trainers.parts import PartRecord, train_part
+from torchrl_pomdp.trainers.peers import compare_peers
 from torchrl_pomdp.trainers.plan import Evaluate, Improve
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
 from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt, r_t
@@ -17,6 +18,7 @@ __all__ = [
     "PolicyIteration",
     "PolicyIterationConfig",
     "api",
+    "compare_peers",
     "load_checkpoint",
     "make_networks",
     "make_values",

@@ -7,6 +7,7 @@ from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
 from torchrl_pomdp.envs.repair.rendering import trajectory_figure
 from torchrl_pomdp.envs.repair.symmetry import Symmetry, symmetries
+from torchrl_pomdp.envs.repair.tabular import joint_belief, tabular_model
 
 __all__ = [
     "REPAIR",
@@ -19,7 +20,9 @@ __all__ = [
     "UniformStart",
     "damage_chain",
     "grid",
+    "joint_belief",
     "line",
     "symmetries",
+    "tabular_model",
     "trajectory_figure",
 ]

@@ -11,6 +11,7 @@ elementwise passes over contiguous memory. What callers see is a ``[*B, L, K]`` 
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -27,6 +28,7 @@ from torchrl_pomdp.envs.repair.partition import RepairPartition, location_costs
 from torchrl_pomdp.envs.repair.robots import Robots, digits
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.sums import multiply_first, sum_first
+from torchrl_pomdp.envs.world import World
 from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype
 
 __all__ = ["REPAIR", "RepairModel"]
@@ -75,7 +77,7 @@ class RepairModel(Robots):
     chain: Tensor
     costs: Tensor
     destinations: Tensor
-    _legal_when_intact: Tensor
+    legal_when_intact: Tensor
     first_controls: Tensor
     _levels: Tensor
 
@@ -125,7 +127,7 @@ class RepairModel(Robots):
             # [L, A]: location after a robot's control, -1 where the move leaves the graph.
             "destinations": destinations,
             # [L, A]: legal controls of a robot whose location is known to be intact.
-            "_legal_when_intact": torch.cat([~moves.any(-1, keepdim=True), moves], -1),
+            "legal_when_intact": torch.cat([~moves.any(-1, keepdim=True), moves], -1),
             "first_controls": self.graph.first_controls,
             "_levels": torch.arange(self.num_levels).unsqueeze(-1),
         }
@@ -189,12 +191,26 @@ class RepairModel(Robots):
     def action_mask(self, y: TensorDictBase) -> Tensor:
         """Legal joint controls, bool ``[*B, U]``: every robot's control is legal for it."""
         belief, location = y.get("belief"), y.get("location")
-        robots = self._legal_when_intact.index_select(0, location.flatten()).unflatten(0, location.shape)
+        robots = self.legal_when_intact.index_select(0, location.flatten()).unflatten(0, location.shape)
         robots[..., REPAIR] |= belief[..., 0].gather(-1, location) < 1.0
         mask = robots[..., 0, :]
         for robot in range(1, self.num_robots):
             mask = (mask.unsqueeze(-1) & robots[..., robot, :].unsqueeze(-2)).flatten(-2)
         return mask
+
+    def unrestricted(self) -> RepairModel:
+        """The same model where intact locations may be repaired, as the paper's peers took it (Section VI-D).
+
+        Examples:
+            >>> from torchrl_pomdp.problems import make_problem
+            >>> problem = make_problem("line3")
+            >>> y = problem.start(torch.arange(1)).set("belief", torch.eye(5)[:1].expand(1, 3, 5))
+            >>> problem.model.action_mask(y).tolist(), problem.model.unrestricted().action_mask(y).tolist()
+            ([[False, False, True]], [[True, False, True]])
+        """
+        other = copy.copy(self)
+        other._buffers = {**self._buffers, "legal_when_intact": self.destinations >= 0}
+        return other
 
     # ---- the model -----------------------------------------------------------------------------------------------
 
@@ -262,6 +278,13 @@ class RepairModel(Robots):
         planes, location = self._planes(y).clone(), y.get("location").reshape(-1, self.num_robots).T
         levels = self._draw_levels([self._levels_at(planes, place) for place in location], location, noise)
         return self._successor(y, self._set_levels(planes, location, levels), location)
+
+    def world(self) -> World:
+        """The true damage levels."""
+        # Not at the top: the world knows the model.
+        from torchrl_pomdp.envs.repair.world import RepairWorld
+
+        return RepairWorld(self)
 
     # ---- kernels on planes [L, K, N] and locations [R, N] ----------------------------------------------------------
 

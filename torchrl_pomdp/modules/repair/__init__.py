@@ -8,12 +8,12 @@ from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.modules.repair.base_policies import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.modules.repair.encoders import RelativeEncoder
 from torchrl_pomdp.modules.repair.terminal_costs import NeverRepairCost, SteadyStateCost
-from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, offer_engines
+from torchrl_pomdp.modules.scalar import Limited, SearchEngine, offer_engines
 
 __all__ = ["GreedyRepair", "NeverRepairCost", "RelativeEncoder", "SteadyStateCost", "UrgencyRepair"]
 
 
-def _local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+def _local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -> SearchEngine | None:
     from torchrl_pomdp.modules.repair.scalar.networks import network_engine
 
     return network_engine(policies, cast(RepairModel, model), limits)

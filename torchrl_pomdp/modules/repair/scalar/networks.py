@@ -17,12 +17,12 @@ from torchrl_pomdp.modules.networks import PolicyNetwork
 from torchrl_pomdp.modules.repair.encoders import RelativeEncoder
 from torchrl_pomdp.modules.repair.scalar.engine import RepairEngine, repair_engine
 from torchrl_pomdp.modules.repair.scalar.twins import greedy, networks, random
-from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
+from torchrl_pomdp.modules.scalar import Limited, SearchEngine, scalar_engine
 
 __all__ = ["network_engine"]
 
 
-def network_engine(policies: Sequence[Any], model: RepairModel, limits: Limited) -> ScalarEngine | None:
+def network_engine(policies: Sequence[Any], model: RepairModel, limits: Limited) -> SearchEngine | None:
     """The engine of local policies, one for each part, of which some are networks; None where there is no twin for them.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_pomdp.envs.repair.model import RepairModel
+from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
 from torchrl_pomdp.modules.repair.base_policies import first_moves
 from torchrl_pomdp.modules.repair.scalar.view import Tables
@@ -40,6 +40,7 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
         distances=distances.astype(np.int64),
         first_controls=model.graph.first_controls.numpy(),
         first_moves=first_moves(model).numpy(),
+        unrestricted=bool(model.legal_when_intact[:, REPAIR].all()),
         columns=np.zeros(size) if own is None else own.columns.double().numpy(),
         prices=np.array(costs if own is None else own.prices, np.float64),
         absorbing=absorbing,

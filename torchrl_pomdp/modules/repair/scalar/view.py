@@ -30,6 +30,7 @@ class Tables(NamedTuple):
         distances: moves from one location to another, ``[L, L]``.
         first_controls: the control that starts a shortest path, ``[L, L]``.
         first_moves: the lowest move at a location, or repair where there is none, ``[L]``.
+        unrestricted: whether intact locations may be repaired.
         columns: the partition's columns, ``[L]``.
         prices: cost of every level, as the partition has them, ``[K]``.
         absorbing: whether level 0 is, so that there are terminal states.
@@ -53,6 +54,7 @@ class Tables(NamedTuple):
     distances: NDArray[np.int64]
     first_controls: NDArray[np.int64]
     first_moves: NDArray[np.int64]
+    unrestricted: bool
     columns: NDArray[np.float64]
     prices: NDArray[np.float64]
     absorbing: bool
@@ -131,7 +133,7 @@ def legal_at(tables, place, known_intact, control):
         return False
     if control > 0:
         return tables.destinations[place, control] >= 0
-    return not known_intact or tables.first_moves[place] == 0
+    return not known_intact or tables.first_moves[place] == 0 or tables.unrestricted
 
 
 @inner

@@ -1,0 +1,224 @@
+"""POMCP and DESPOT: legality, determinism, convergence to known optima, refusals."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_pomdp.envs.repair import UniformStart, joint_belief, tabular_model
+from torchrl_pomdp.evaluation import compare, discounted_costs
+from torchrl_pomdp.modules import Myopic
+from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.planners import DESPOT, POMCP, solve, tree_search
+from torchrl_pomdp.problems import make_problem
+
+SEARCHES = {
+    "pomcp": lambda model, policy, **options: POMCP(model, policy, **{"simulations": 60, **options}),
+    "despot": lambda model, policy, **options: DESPOT(model, policy, **{"simulations": 4, "scenarios": 12, **options}),
+}
+
+
+@pytest.fixture(scope="module", params=sorted(SEARCHES))
+def make(request):
+    return SEARCHES[request.param]
+
+
+def test_decisions_do_not_depend_on_the_batch(make, linear20):
+    policy = UrgencyRepair(linear20.model)
+    y = linear20.start(torch.arange(5))
+    together = make(linear20.model, policy)(y.clone())
+    for number in (0, 4):
+        alone = make(linear20.model, policy)(y[number].clone())
+        assert torch.equal(alone["q_factors"], together["q_factors"][number])
+        assert int(alone["action"]) == int(together["action"][number])
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1 if threads > 1 else 2)
+        assert torch.equal(make(linear20.model, policy)(y.clone())["q_factors"], together["q_factors"])
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(make(linear20.model, policy)(y.unsqueeze(0).clone())["q_factors"][0], together["q_factors"])
+    assert not torch.equal(make(linear20.model, policy, seed=1)(y.clone())["q_factors"], together["q_factors"])
+    assert make(linear20.model, policy)(y[:0].clone())["q_factors"].shape == (0, 3)
+
+
+def test_copies_decide_alike(make, line3):
+    search = make(line3.model, GreedyRepair(line3.model))
+    y = line3.start(torch.arange(3))
+    first = search(y.clone())["q_factors"]
+    for other in (copy.deepcopy(search), pickle.loads(pickle.dumps(search))):
+        assert torch.equal(other(y.clone())["q_factors"], first)
+    assert search.simulated_steps > 0
+
+
+@pytest.mark.parametrize("name", ["linear20", "two_robots20", "tiger"])
+@pytest.mark.parametrize("base", [0, None])
+def test_play_is_legal(make, name, base):
+    problem = make_problem(name)
+    model = problem.model
+    policy = None if base is None else list(problem.base_policies.values())[base]
+    search = make(model, policy, max_steps=30)
+    y = model.with_features(problem.start(torch.arange(8)))
+    noise = torch.rand(6, 8, model.noise_dim, generator=torch.Generator().manual_seed(0))
+    for step in range(6):
+        decided = search(y.clone())
+        # Raises where one is illegal.
+        model.check_controls(y, decided["action"])
+        assert torch.isinf(decided["q_factors"][~y["action_mask"]]).all()
+        assert torch.isfinite(decided["q_factors"].gather(-1, decided["action"].unsqueeze(-1))).all()
+        _, y = model.advance(y, decided["action"], noise[step])
+
+
+def test_more_than_what_is_legal_can_be_searched(make, line3):
+    model = line3.model.unrestricted()
+    belief = torch.eye(5)[torch.tensor([0, 3, 3])].expand(1, 3, 5)
+    y = line3.start(torch.arange(1)).set("belief", belief).set("location", torch.zeros(1, 1, dtype=torch.int64))
+    assert torch.isfinite(make(model, None)(y.clone())["q_factors"]).tolist() == [[True, False, True]]
+    assert torch.isfinite(make(line3.model, None)(y.clone())["q_factors"]).tolist() == [[False, False, True]]
+
+
+def test_a_terminal_state_asks_for_anything_legal(make, line3):
+    y = line3.start(torch.arange(1)).set("belief", torch.eye(5)[:1].expand(1, 3, 5))
+    decided = make(line3.model, GreedyRepair(line3.model))(y)
+    line3.model.check_controls(y, decided["action"])
+    assert decided["q_factors"][0, decided["action"]] == 0.0
+
+
+def test_time_is_a_budget(make, linear20):
+    search = make(linear20.model, UrgencyRepair(linear20.model), simulations=None, seconds=0.02)
+    y = linear20.start(torch.arange(2))
+    search(y.clone())
+    little = search.simulated_steps
+    more = make(linear20.model, UrgencyRepair(linear20.model), simulations=None, seconds=0.4)
+    decided = more(y.clone())
+    linear20.model.check_controls(y, decided["action"])
+    assert more.simulated_steps > 2 * little
+
+
+def regrets(problem, table, y, search, exact):
+    """How much more than the optimum a search's control costs, followed by the best policy, for each of ``y``."""
+    model, decided = problem.model, search(y.clone())
+    u = decided["action"]
+    cost = model.expected_cost(y, u).double()
+    probs = model.observation_probs(y, u).double()
+    for z in range(model.num_observations):
+        rows = (probs[:, z] > 0).nonzero().squeeze(-1)
+        after = model.estimator(y[rows], u[rows], torch.full_like(rows, z))
+        cost[rows] += model.discount * probs[rows, z] * exact(table(after))
+    return cost - exact(table(y))
+
+
+@pytest.fixture(scope="module")
+def line3_exact(line3):
+    start = UniformStart(line3.model)(torch.arange(40))
+    table = tabular_model(line3.model)
+    solution = solve(table, joint_belief(line3.model, start), relative_gap=0.003)
+    return start, lambda y: TensorDict({"belief": joint_belief(line3.model, y)}, y.batch_size), solution
+
+
+@pytest.mark.parametrize(
+    ("search", "few", "many"),
+    [
+        (lambda model, n: POMCP(model, UrgencyRepair(model), simulations=n), 10, 10_000),
+        (lambda model, n: DESPOT(model, UrgencyRepair(model), simulations=n, scenarios=max(5, n)), 1, 1000),
+    ],
+    ids=["pomcp", "despot"],
+)
+def test_decisions_on_the_line_of_3_become_those_of_the_optimum(line3, line3_exact, search, few, many):
+    y, table, solution = line3_exact
+    exact = solution.policy.cost
+    loose, tight = (regrets(line3, table, y, search(line3.model, n), exact).mean() for n in (few, many))
+    optimum = float(exact(table(y)).mean())
+    assert tight < 0.002 * optimum
+    assert tight <= loose + 1e-9
+
+
+def test_bounds_hold_the_optimum_of_the_line_of_3(line3, line3_exact):
+    y, table, solution = line3_exact
+    low, high = DESPOT(line3.model, UrgencyRepair(line3.model), simulations=300, scenarios=2000).bounds(y)
+    exact = solution.policy.cost(table(y))
+    # The mean over 2000 scenarios errs by about half a percent of a cost.
+    assert bool((low <= exact * 1.01).all())
+    assert bool((high >= exact * 0.99).all())
+    assert float((high - low).mean()) < 0.1 * float(exact.mean())
+
+
+@pytest.mark.parametrize("base", [None, "myopic"])
+def test_tiger_is_solved(base):
+    problem = make_problem("tiger")
+    policy = None if base is None else Myopic(problem.model)
+    y = problem.start(torch.arange(1))
+    for belief, best in ((0.5, 0), (0.85, 0), (0.9698, 1), (0.0302, 2)):
+        y.set("belief", torch.tensor([[1 - belief, belief]]))
+        names = problem.model.control_names
+        for search in (
+            POMCP(problem.model, policy, simulations=20_000, exploration=1.0, max_steps=40),
+            DESPOT(problem.model, policy, simulations=1500, scenarios=300, max_steps=40),
+        ):
+            assert int(search(y.clone())["action"]) == best, (belief, names, type(search).__name__)
+
+
+def test_the_base_policy_answers_where_nothing_is_better(linear20):
+    model = linear20.model
+    y = linear20.start(torch.arange(6))
+    heavy = DESPOT(model, UrgencyRepair(model), simulations=3, scenarios=5, regularisation=1e9)
+    assert torch.equal(heavy(y.clone())["action"], UrgencyRepair(model)(y.clone())["action"])
+
+
+def test_the_relaxation_closes_the_gap_sooner(linear20):
+    model, y = linear20.model, linear20.start(torch.arange(4))
+    gaps = []
+    for bound in ("trivial", "relaxed"):
+        low, high = DESPOT(model, UrgencyRepair(model), simulations=3, scenarios=20, bound=bound).bounds(y)
+        assert bool((low <= high).all())
+        gaps.append((high - low) / high)
+    assert bool((gaps[1] < 0.7 * gaps[0]).all())
+
+
+def test_searches_improve_their_base_policy(make, linear20):
+    urgency = UrgencyRepair(linear20.model)
+    costs = [
+        discounted_costs(linear20.model, policy, linear20.start, num_states=60, seed=3)
+        for policy in (make(linear20.model, urgency), urgency)
+    ]
+    assert compare(*costs).ratio.interval[1] < 1.0
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        (POMCP, {}, "simulations or seconds must be given, and not both"),
+        (POMCP, {"simulations": 5, "seconds": 1.0}, "simulations or seconds must be given, and not both"),
+        (DESPOT, {"simulations": 5, "scenarios": 0}, "scenarios must be at least 1, got 0"),
+        (DESPOT, {"simulations": 5, "regularisation": -1.0}, "regularisation must be"),
+        (DESPOT, {"simulations": 5, "gap": 1.0}, "gap must be"),
+        (DESPOT, {"simulations": 5, "depth": 0}, "depth must be at least 1, got 0"),
+        (DESPOT, {"simulations": 5, "bound": "magic"}, "bound must be"),
+        (POMCP, {"simulations": 5, "exploration": -0.1}, "exploration must be"),
+        (POMCP, {"seconds": 0.0}, "seconds must be"),
+        (POMCP, {"simulations": 0}, "simulations must be at least 1, got 0"),
+    ],
+)
+def test_refusals(kind, options, message, line3):
+    with pytest.raises(ValueError, match=message):
+        kind(line3.model, None, **options)
+
+
+def test_models_and_policies_without_a_twin_are_refused(make, line3, linear20):
+    rocks = make_problem("rocksample7x8")
+    with pytest.raises(ValueError, match=r"model must have a scalar twin.*RockSample"):
+        make(rocks.model, None)
+    with pytest.raises(ValueError, match=r"base_policy must have a scalar twin.*function"):
+        make(line3.model, lambda y: y)
+    with pytest.raises(ValueError, match="base_policy must have a scalar twin"):
+        make(line3.model, GreedyRepair(linear20.model))
+
+
+def test_without_numba_it_says_what_to_install(make, line3, monkeypatch):
+    monkeypatch.setattr(tree_search, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"needs numba: pip install 'torchrl-pomdp\[fast\]'"):
+        make(line3.model, None)

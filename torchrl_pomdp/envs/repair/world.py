@@ -1,0 +1,90 @@
+"""The hidden states of the repair problem (paper, Section VI-A): the damage levels that the robots do not see."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Categorical, Composite
+
+from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
+from torchrl_pomdp.envs.rows import inverse_cdf
+from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.envs.world import World
+
+__all__ = ["RepairWorld"]
+
+
+class RepairWorld(World):
+    """The true levels of a :class:`RepairModel`.
+
+    Entries: ``"level"`` int64 ``[*B, L]`` and ``"location"`` int64 ``[*B, R]``, where the robots stand. Every control that
+    keeps the robots on the graph can be carried out. All levels at 0 are terminal if level 0 is absorbing.
+
+    Args:
+        model: the repair model.
+
+    Examples:
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> problem = make_problem("line3")
+        >>> world, repair, key = problem.model.world(), torch.tensor(REPAIR), torch.tensor(1)
+        >>> hidden = world.sample(problem.start(key), key)
+        >>> hidden["level"].tolist(), hidden["location"].tolist()
+        ([1, 1, 4], [0])
+        >>> cost, hidden, z = world.step(hidden, repair, key)
+        >>> round(float(cost), 2), hidden["level"].tolist(), int(z)
+        (100.2, [0, 1, 4], 0)
+    """
+
+    model: RepairModel
+
+    def __init__(self, model: RepairModel) -> None:
+        super().__init__(model)
+        self.draw_dim = self.noise_dim = model.num_locations
+
+    def hidden_spec(self, batch_size: torch.Size | tuple[int, ...] = ()) -> Composite:
+        """``level`` ``[*B, L]`` and ``location`` ``[*B, R]``."""
+        shape, model = torch.Size(batch_size), self.model
+        levels, robots = (*shape, model.num_locations), (*shape, model.num_robots)
+        return Composite(
+            level=Categorical(model.num_levels, shape=levels, dtype=torch.int64, device=model.device),
+            location=Categorical(model.num_locations, shape=robots, dtype=torch.int64, device=model.device),
+            shape=shape,
+            device=model.device,
+        )
+
+    def action_mask(self, hidden: TensorDictBase) -> Tensor:
+        """Joint controls that keep the robots on the graph, bool ``[*B, U]``: those that are legal where no level is known."""
+        location, model = hidden.get("location"), self.model
+        unknown = torch.zeros((), dtype=model.dtype, device=model.device)
+        unknown = unknown.expand(*hidden.batch_size, model.num_locations, model.num_levels)
+        return model.action_mask(TensorDict({"belief": unknown, "location": location}, batch_size=hidden.batch_size))
+
+    def is_terminal(self, hidden: TensorDictBase) -> Tensor:
+        """Bool ``[*B]``: nothing is damaged; never where level 0 is not absorbing."""
+        intact = (hidden.get("level") == 0).all(-1)
+        return intact if self.model.level_zero_absorbing else torch.zeros_like(intact)
+
+    def draw(self, y: TensorDictBase, noise: Tensor) -> TensorDictBase:
+        """A level for each location by its marginal; see :meth:`World.draw`."""
+        return self._hidden(inverse_cdf(y.get("belief"), noise), y.get("location"))
+
+    def advance(self, hidden: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase, Tensor]:
+        """Costs, controls, the chain where nothing is repaired, observations, in this order; see :meth:`World.advance`."""
+        level, location, model = hidden.get("level"), hidden.get("location"), self.model
+        cost = sum_first(model.costs[level].movedim(-1, 0).clone())
+        controls = model.split_controls(u)
+        repairs = torch.zeros_like(level).scatter_add(-1, location, (controls == REPAIR).to(torch.int64))
+        level = inverse_cdf(model.chain[level], noise).masked_fill(repairs > 0, 0)
+        location = model.destinations[location, controls]
+        return cost, self._hidden(level, location), self._joint(level.gather(-1, location))
+
+    def _joint(self, seen: Tensor) -> Tensor:
+        """The joint observation of levels ``[*B, R]``, whose base-K digits they are."""
+        z = seen[..., 0]
+        for robot in range(1, self.model.num_robots):
+            z = z * self.model.num_levels + seen[..., robot]
+        return z
+
+    def _hidden(self, level: Tensor, location: Tensor) -> TensorDict:
+        return TensorDict({"level": level, "location": location}, batch_size=level.shape[:-1], device=self.model.device)

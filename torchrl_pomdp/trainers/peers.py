@@ -1,0 +1,261 @@
+r"""Every method on one problem, from the same start states and under the same noise (paper, Section VI-D).
+
+============== ==================================================================================================
+name           what it is
+============== ==================================================================================================
+greedy, …      the problem's base policies
+R-NT, R-T      online rollout of the last base policy, without and with truncation
+pAPI-NT k, …   the trained policy, and online rollout on top of it
+POMCP, DESPOT  tree searches: ``orig`` with every control that can be carried out and random play, as out of the box;
+               ``mod`` with legal controls and random play; ``fair`` with legal controls and a good base policy
+PPO            masked proximal policy optimisation, with as many belief steps as policy iteration has simulated
+============== ==================================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_number, check_path
+from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
+from torchrl_pomdp.evaluation import compare, discounted_costs
+from torchrl_pomdp.identity import digest
+from torchrl_pomdp.kept import keep, kept
+from torchrl_pomdp.modules import Policy, RolloutPolicy
+from torchrl_pomdp.modules.threads import kept_threads
+from torchrl_pomdp.noise import fold, seed_keys
+from torchrl_pomdp.planners import DESPOT, POMCP
+from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.report.peers import Outcome
+from torchrl_pomdp.trainers.architecture import make_networks
+from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest
+from torchrl_pomdp.trainers.ppo import ppo
+from torchrl_pomdp.trainers.recipes import r_t
+
+__all__ = ["compare_peers"]
+
+# Start states whose costs are kept at once: an interrupted comparison loses no more.
+_BLOCK = 10
+# Decisions whose time is taken.
+_TIMED = 15
+# Most trajectories of an online decision; its time ends it.
+_TRAJECTORIES = 4096
+
+
+@dataclass(frozen=True)
+class _Peer:
+    """A method: how its policy is made, and whether it may do all that can be carried out."""
+
+    make: Callable[[], Policy]
+    unrestricted: bool = False
+
+
+def compare_peers(
+    problem: Problem,
+    folder: str | PathLike[str],
+    *,
+    checkpoint: Checkpoint | None = None,
+    ppo_steps: int | None = None,
+    states: int = 100,
+    seconds: float = 0.1,
+    seed: int = EVALUATION_SEED,
+    report: Callable[[str, Outcome], None] = lambda name, outcome: None,
+    progress: bool = False,
+) -> dict[str, Outcome]:
+    """Compare all methods, or go on with an interrupted comparison.
+
+    Args:
+        problem: the problem.
+        folder: where results are kept; new, empty, or that of the same comparison.
+
+    Keyword Args:
+        checkpoint: a trained policy of the problem; None: without one.
+        ppo_steps: belief steps that PPO is trained for; None: without PPO.
+        states: start states.
+        seconds: time of each decision of the methods that plan online.
+        seed: seed of start states and noise, and of PPO.
+        report: called with the name of a method and its outcome as soon as it is known.
+        progress: whether to show progress bars.
+
+    Returns:
+        outcomes by method, the baseline first.
+
+    Raises:
+        ImportError: if numba, which the extra ``fast`` installs, is missing.
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if a number is out of range, the folder holds something else, the checkpoint is of another problem, or
+            the model or the last base policy has no scalar twin.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     outcomes = compare_peers(make_problem("line3"), folder, states=2, seconds=0.001)
+        >>> list(outcomes)[:4]
+        ['greedy', 'urgency', 'R-NT of urgency', 'POMCP orig']
+    """
+    check_instance("problem", problem, Problem)
+    check_integer("states", states, 2, MAX_STATES)
+    check_number("seconds", seconds, "(0, inf)")
+    check_integer("seed", seed)
+    check_callable("report", report)
+    check_flag("progress", progress)
+    if checkpoint is not None:
+        check_instance("checkpoint", checkpoint, Checkpoint)
+        if problem_digest(checkpoint.problem) != problem_digest(problem):
+            raise ValueError(f"checkpoint must be of the problem {problem.name}, got one of {checkpoint.problem.name}")
+    if ppo_steps is not None:
+        check_integer("ppo_steps", ppo_steps, 1)
+    found = {"problem": problem_digest(problem), "seconds": seconds, "seed": seed}
+    path = open_run_folder(check_path("folder", folder), found)
+    peers = _peers(problem, checkpoint, seconds)
+    if ppo_steps is not None:
+        peers["PPO"] = _Peer(partial(_trained_ppo, problem, path, ppo_steps, seed, progress))
+    execution = _Execution(problem, path, states, seed, progress)
+    outcomes: dict[str, Outcome] = {}
+    for name, peer in peers.items():
+        outcomes[name] = execution.outcome(name, peer)
+        report(name, outcomes[name])
+    return outcomes
+
+
+def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> dict[str, _Peer]:
+    """The methods by name, made when they are asked for."""
+    model, bases = problem.model, problem.base_policies
+    base_name, base = list(bases.items())[-1]
+    online: dict[str, Any] = {"trajectories": _TRAJECTORIES, "allocation": "adaptive", "seconds": seconds}
+    peers = {name: _Peer(partial(_given, policy)) for name, policy in bases.items()}
+    peers[f"R-NT of {base_name}"] = _Peer(partial(RolloutPolicy, model, base, **online))
+    if checkpoint is not None:
+        if len(problem.partition.stages) > 1:
+            peers[f"R-T of {base_name}"] = _Peer(partial(r_t, problem, base, checkpoint.value, **online))
+        peers[checkpoint.name] = _Peer(partial(_given, checkpoint.policy))
+        peers[f"{checkpoint.name} + R-NT"] = _Peer(partial(RolloutPolicy, model, checkpoint.policy, **online))
+    for search in (POMCP, DESPOT):
+        everything, name = model.unrestricted(), search.__name__
+        bound: dict[str, Any] = {"bound": "trivial"} if search is DESPOT else {}
+        peers[f"{name} orig"] = _Peer(partial(search, everything, None, seconds=seconds, **bound), unrestricted=True)
+        peers[f"{name} mod"] = _Peer(partial(search, model, None, seconds=seconds, **bound))
+        peers[f"{name} fair"] = _Peer(partial(search, model, base, seconds=seconds))
+    return peers
+
+
+def _given(policy: Policy) -> Policy:
+    return policy
+
+
+def _trained_ppo(problem: Problem, folder: Path, steps: int, seed: int, progress: bool) -> Policy:
+    """PPO's policy, from the folder where it has been trained."""
+    path, owner = folder / "ppo.pt", digest([problem_digest(problem), steps, seed])
+    content = kept(path, owner)
+    if content is None:
+        trained = ppo(problem, steps=steps, seed=seed, progress=progress)
+        keep(path, owner, {"policy": trained.state_dict()})
+        return trained
+    policy = make_networks(problem.unpartitioned(), PolicyIterationConfig(), seed).policies[0].eval()
+    policy.load_state_dict(content["policy"])
+    return policy
+
+
+class _Counted:
+    """A policy whose decisions are counted."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy, self.decisions = policy, 0
+        self.in_keys = getattr(policy, "in_keys", ())
+
+    def __call__(self, y: TensorDictBase) -> TensorDictBase:
+        self.decisions += y.batch_size.numel()
+        return self.policy(y)
+
+
+@dataclass
+class _Execution:
+    problem: Problem
+    folder: Path
+    states: int
+    seed: int
+    progress: bool
+    _baseline: torch.Tensor | None = None
+
+    def outcome(self, name: str, peer: _Peer) -> Outcome:
+        """A method's costs, from the folder as far as they are there."""
+        policy = peer.make()
+        blocks = list(self._blocks(name, peer, policy))
+        costs = torch.cat([block["costs"] for block in blocks])
+        if self._baseline is None:
+            self._baseline = costs
+        decisions, steps = (sum(block[key] for block in blocks) for key in ("decisions", "steps"))
+        return Outcome(compare(costs, self._baseline), self._time(name, policy), steps / max(decisions, 1))
+
+    def _blocks(self, name: str, peer: _Peer, policy: Policy) -> Iterator[dict[str, Any]]:
+        model = self.problem.model.unrestricted() if peer.unrestricted else self.problem.model
+        owner = digest([problem_digest(self.problem), name, policy, self.seed])
+        for first in range(0, self.states, _BLOCK):
+            count = min(_BLOCK, self.states - first)
+            path = self.folder / name / f"{first:07d}-{count}.pt"
+            block = kept(path, f"{owner} {first}")
+            if block is None:
+                block = self._evaluate(f"{name}, from state {first}", model, policy, first, count)
+                keep(path, f"{owner} {first}", block)
+            yield block
+
+    def _evaluate(self, name: str, model: Any, policy: Policy, first: int, count: int) -> dict[str, Any]:
+        simulates = _simulated_steps(policy) is not None
+        counted = _Counted(policy) if simulates else policy
+        before = _simulated_steps(policy) or 0
+        costs = discounted_costs(
+            model,
+            counted,
+            self.problem.start,
+            num_states=count,
+            first=first,
+            seed=self.seed,
+            terminal_cost=self.problem.pessimistic_cost,
+            progress=self.progress,
+            name=name,
+        )
+        steps = (_simulated_steps(policy) or 0) - before
+        return {"costs": costs.cpu(), "decisions": counted.decisions if isinstance(counted, _Counted) else 0, "steps": steps}
+
+    def _time(self, name: str, policy: Policy) -> float:
+        """Median time of a decision in the first start states, taken once."""
+        path, owner = self.folder / name / "time.pt", digest([problem_digest(self.problem), name, policy, self.seed])
+        content = kept(path, owner)
+        if content is None:
+            model = self.problem.model
+            keys = seed_keys(self.seed, torch.arange(_TIMED + 1, device=model.device))
+            y = model.derive(model.drawn(self.problem.start, fold(keys, 0)))
+            with kept_threads(1), torch.no_grad():
+                # The first decision compiles.
+                times = [_seconds(policy, y[number : number + 1]) for number in range(_TIMED + 1)][1:]
+            content = {"seconds": median(times)}
+            keep(path, owner, content)
+        return float(content["seconds"])
+
+
+def _seconds(policy: Policy, y: TensorDictBase) -> float:
+    begin = perf_counter()
+    policy(y.clone())
+    return perf_counter() - begin
+
+
+def _simulated_steps(policy: Policy) -> int | None:
+    """Belief steps that a policy, or the rollouts in it, have simulated; None where it simulates nothing."""
+    if not isinstance(policy, TensorDictModuleBase):
+        return None
+    if hasattr(policy, "simulated_steps"):
+        return int(policy.simulated_steps)
+    parts = {part for part in policy.modules() if isinstance(part, RolloutPolicy)}
+    return sum(part.simulated_steps for part in parts) if parts else None
