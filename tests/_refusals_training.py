@@ -176,6 +176,13 @@ TRAINERS = {
     "trainers.papi_nt": lambda _: an_algorithm(trainers.papi_nt),
     "trainers.papi_t": lambda _: an_algorithm(trainers.papi_t),
     "trainers.api": lambda _: an_algorithm(trainers.api, partitioned=False),
+    "trainers.ppo": lambda _: case(
+        trainers.ppo,
+        problem=a_problem(),
+        steps=(4096, integers(4096, 10**12)),
+        seed=(0, seeds()),
+        progress=(False, flags()),
+    ),
     "trainers.r_nt": lambda _: case(trainers.r_nt, problem=a_problem(), base_policy=(greedy(), not_callable())),
     "trainers.r_t": lambda _: case(
         trainers.r_t, lambda made: made(state()),

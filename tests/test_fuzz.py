@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 from _hostile import Hostile
 from _refusals_exact import EXACT
+from _refusals_peers import PEERS
 from _refusals_planning import ENVS, MODULES
 from _refusals_problems import PROBLEMS
 from _refusals_results import FILES, REPORTS
@@ -35,7 +36,7 @@ CASES: dict[str, Callable[[Path], Case]] = {
     **REPORTS,
     **FILES,
 }
-CASES |= EXACT
+CASES |= EXACT | PEERS
 
 PUBLIC = (
     *("envs", "envs.repair", "modules", "modules.repair", "problems"),

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl_pomdp.envs import TabularModel
 from torchrl_pomdp.envs.repair import Graph, RepairModel, damage_chain, line
 from torchrl_pomdp.modules import Myopic, TruncatedRollout
-from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.modules.repair import UrgencyRepair
 from torchrl_pomdp.modules.repair.scalar import View
 from torchrl_pomdp.modules.scalar import Limited, local_engine, scalar_engine
 from torchrl_pomdp.noise import fold, seed_keys
@@ -158,7 +158,7 @@ def test_histories_are_those_of_the_model(model):
 
 def engines(model):
     limits = Limited(60, None, None)
-    policies = [Myopic(model)] if isinstance(model, TabularModel) else [GreedyRepair(model), UrgencyRepair(model)]
+    policies = [Myopic(model) if isinstance(model, TabularModel) else UrgencyRepair(model)]
     return [local_engine((), model, limits), *(scalar_engine(policy, model, limits) for policy in policies)], policies
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_pomdp.scalar.compiling import inner, outer
+from torchrl_pomdp.scalar.compiling import inner, outer, shared
 from torchrl_pomdp.scalar.models import (
     costs,
     keep,
@@ -102,7 +102,7 @@ def _weight(tree, node, options):
     return options.discount ** tree.depths[node] / options.scenarios
 
 
-@inner
+@shared
 def _evaluate(model, policy, state, tree, node, key, options, least):
     """First bounds of a node whose state is in ``state``: by the base policy, and by the model."""
     tree.ended[node] = over(model, state)
@@ -133,7 +133,7 @@ def _evaluate(model, policy, state, tree, node, key, options, least):
     return steps, DONE
 
 
-@inner
+@shared
 def _branch(model, state, tree, node, u, key, options, numbers):
     """Make the children of a node by a control, one for each observation of its scenarios; returns how many they are.
 
@@ -166,7 +166,7 @@ def _branch(model, state, tree, node, u, key, options, numbers):
     return made
 
 
-@inner
+@shared
 def _expand(model, policy, state, tree, node, key, options, least, numbers):
     """Give a node its children by all legal controls."""
     steps, weight = 0, _weight(tree, node, options) * tree.counts[node]
@@ -200,7 +200,7 @@ def _through(tree, node, u, bounds):
     return total
 
 
-@inner
+@shared
 def _best(tree, node, bounds, options):
     """The control that is best by a bound, and its cost with the regularisation."""
     best, lowest = -1, np.inf
@@ -240,7 +240,7 @@ def _close(tree, node):
     tree.upper[node] = tree.base[node]
 
 
-@inner
+@shared
 def _back_up(tree, node, options):
     """Bounds from those of the children, up to the root; returns whether they have crossed."""
     while node >= 0:
@@ -261,7 +261,7 @@ def _fits(tree, node):
     return tree.size[0] + most <= len(tree.counts) and tree.size[1] + most <= len(tree.members)
 
 
-@inner
+@shared
 def _grow(model, policy, state, tree, key, options, least, numbers):
     """One exploration from the root; the tree stays as it is where it is full."""
     node, steps = 0, 0
@@ -289,7 +289,7 @@ def _grow(model, policy, state, tree, key, options, least, numbers):
         node = following
 
 
-@inner
+@shared
 def _plant(model, policy, state, tree, key, options, least):
     """The root, with all scenarios."""
     start(model, state)

@@ -28,7 +28,7 @@ class POMCP(TreeSearch):
 
     .. math:: Q(h,u)-c\,\sqrt{\log N(h)/N(h,u)},
 
-    where c is ``exploration`` times the mean cost of the simulations so far; controls that were never taken come first.
+    where c is ``exploration`` times the range of the simulations' costs so far; controls that were never taken come first.
 
     Args:
         model: the belief model; it needs a scalar twin, as repair and tabular models have.
@@ -37,7 +37,7 @@ class POMCP(TreeSearch):
     Keyword Args:
         simulations: how many a decision makes; or
         seconds: how long it takes; it answers with what it has.
-        exploration: constant of UCB1, not negative.
+        exploration: constant of UCB1 as a fraction of the range, not negative; 1 is the choice of Silver & Veness.
         max_steps: stages after which simulations end; None: :attr:`BeliefModel.horizon`.
         seed: seed of the simulations. They depend on it and on the feature state alone.
 
@@ -96,9 +96,9 @@ class POMCP(TreeSearch):
         """The same tree with room for twice as many nodes."""
         from torchrl_pomdp.planners.pomcp_loop import put_edges
 
-        size, *nodes, names, children = tree
+        size, spread, *nodes, names, children = tree
         table = np.zeros(2 * len(names), np.uint64), np.full(2 * len(names), -1)
-        result = type(tree)(size, *(grown(each) for each in nodes), *table)
+        result = type(tree)(size, spread, *(grown(each) for each in nodes), *table)
         self.call(put_edges, result, names, children)
         return result
 
@@ -108,6 +108,7 @@ class POMCP(TreeSearch):
         shape = _NODES, self.model.num_controls
         return Tree(
             size=np.zeros(1, np.int64),
+            spread=np.array([np.inf, -np.inf]),
             counts=np.zeros(shape, np.int64),
             means=np.zeros(shape),
             costs=np.zeros(shape),

@@ -21,6 +21,7 @@ class Tree(NamedTuple):
 
     Attributes:
         size: number of nodes, ``[1]``.
+        spread: lowest and highest cost of the simulations from the root, ``[2]``.
         counts: simulations that took a control, ``[N, U]``.
         means: their mean cost, ``[N, U]``.
         costs: expected stage costs, ``[N, U]``.
@@ -31,6 +32,7 @@ class Tree(NamedTuple):
     """
 
     size: NDArray[np.int64]
+    spread: NDArray[np.float64]
     counts: NDArray[np.int64]
     means: NDArray[np.float64]
     costs: NDArray[np.float64]
@@ -98,16 +100,6 @@ def _select(tree, node, exploration):
 
 
 @inner
-def _scale(tree):
-    """Mean absolute cost of the simulations so far."""
-    total, count = 0.0, 0
-    for u in range(tree.means.shape[1]):
-        total += tree.counts[0, u] * abs(tree.means[0, u])
-        count += tree.counts[0, u]
-    return total / max(count, 1)
-
-
-@inner
 def _back_up(tree, path, depth, value, discount):
     """Add a simulation that went on at cost ``value`` to the nodes of its path."""
     for i in range(depth - 1, -1, -1):
@@ -115,6 +107,7 @@ def _back_up(tree, path, depth, value, discount):
         value = tree.costs[node, u] + discount * value
         tree.counts[node, u] += 1
         tree.means[node, u] += (value - tree.means[node, u]) / tree.counts[node, u]
+    tree.spread[0], tree.spread[1] = min(tree.spread[0], value), max(tree.spread[1], value)
 
 
 @outer
@@ -130,7 +123,7 @@ def search(model, policy, state, tree, path, key, first, last, exploration, disc
         key: of the root, unsigned.
         first: number of the first simulation.
         last: number after the last one.
-        exploration: constant of UCB1, as a fraction of the mean cost.
+        exploration: constant of UCB1, as a fraction of the range of the simulations' costs.
         discount: of the model.
         num_observations: of the model.
 
@@ -149,7 +142,7 @@ def search(model, policy, state, tree, path, key, first, last, exploration, disc
             return number, steps, True
         stream, seen = fold(key, np.uint64(number)), nothing
         start(model, state)
-        node, depth, value, spread = 0, 0, 0.0, exploration * _scale(tree)
+        node, depth, value, spread = 0, 0, 0.0, exploration * max(tree.spread[1] - tree.spread[0], 0.0)
         while not tree.ended[node]:
             u = _select(tree, node, spread)
             path.nodes[depth], path.controls[depth] = node, u

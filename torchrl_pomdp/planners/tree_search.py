@@ -153,7 +153,7 @@ class TreeSearch(TensorDictModuleBase):
             steps = map_threads(lambda i: self._decide(roots, i, found[i]), numbers, torch.get_num_threads())
             with self._lock:
                 self.simulated_steps += sum(steps)
-        return torch.from_numpy(found).to(self.model.dtype).view(*y.batch_size, -1)
+        return torch.from_numpy(found).to(self.model.dtype).view(*y.batch_size, found.shape[1])
 
     @abstractmethod
     def _decide(self, roots: Roots, number: int, found: NDArray[np.float64]) -> int:

@@ -20,7 +20,9 @@ _SOON = 1.0
 
 # Without reference counts: they cost more than the simulation, and nothing is allocated in a loop.
 _BARE: dict[str, Any] = {"_nrt": False}
-OPTIONS: dict[str, Any] = {"error_model": "numpy", "forceinline": True, **_BARE}
+# Nobody calls a part of a loop but the loop: half of the time of compiling it would be spent on that.
+_PART: dict[str, Any] = {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_BARE}
+OPTIONS: dict[str, Any] = {"forceinline": True, **_PART}
 """Options of a part of a loop."""
 
 
@@ -48,13 +50,13 @@ def outer(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def shared(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a large part of several loops, which is compiled once and called."""
-    compiled: Callable[..., Any] = njit(error_model="numpy", **_BARE)(function)
+    compiled: Callable[..., Any] = njit(**_PART)(function)
     return compiled
 
 
 def products(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile sums of products, which may be rounded once instead of twice."""
-    compiled: Callable[..., Any] = njit(error_model="numpy", fastmath={"contract"}, **_BARE)(function)
+    compiled: Callable[..., Any] = njit(fastmath={"contract"}, **_PART)(function)
     return compiled
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from inspect import signature
 from typing import Any, cast
 
 from numba import types
@@ -124,24 +125,42 @@ _EVERY = start, keep, recall, mask, costs, over, move, see, seen_after, settle, 
 _OPERATIONS: dict[str, Callable[..., Any]] = {each.__name__: each for each in _EVERY}
 
 
-def _offer(name: str, stub: Callable[..., Any]) -> None:
-    """Let compiled code call the operation of whatever model it is given."""
+def _function(model: Any, name: str) -> Callable[..., Any] | None:
+    """The operation of a model of this type; None if it is no model."""
+    twin = next(iter(model), None) if isinstance(model, Iterable) else None
+    return _MODELS[twin.name][name] if isinstance(twin, ModelType) else None
 
-    @overload(stub, jit_options=cast(Any, OPTIONS))
-    def _operation(model, *args):
-        twin = next(iter(model), None) if isinstance(model, Iterable) else None
-        if not isinstance(twin, ModelType):
-            return None
-        function = _MODELS[twin.name][name]
 
-        def compiled(model, *args):
-            return function(model[1], *args)
+# Compiled functions have no lists of arguments: one way for each number of them.
+def _with_state(name: str) -> Callable[..., Any]:
+    def operation(model, state):
+        function = _function(model, name)
+        return function and (lambda model, state: function(model[1], state))
 
-        return compiled
+    return operation
+
+
+def _with_another(name: str) -> Callable[..., Any]:
+    def operation(model, state, more):
+        function = _function(model, name)
+        return function and (lambda model, state, more: function(model[1], state, more))
+
+    return operation
+
+
+def _with_two(name: str) -> Callable[..., Any]:
+    def operation(model, first, second, third):
+        function = _function(model, name)
+        return function and (lambda model, first, second, third: function(model[1], first, second, third))
+
+    return operation
+
+
+_WAYS = {2: _with_state, 3: _with_another, 4: _with_two}
 
 
 for _name, _stub in _OPERATIONS.items():
-    _offer(_name, _stub)
+    overload(_stub, jit_options=cast(Any, OPTIONS))(_WAYS[len(signature(_stub).parameters)](_name))
 
 
 @typeof_impl.register(ScalarModel)

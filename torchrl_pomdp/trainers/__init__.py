@@ -7,6 +7,7 @@ from torchrl_pomdp.trainers.parts import PartRecord, train_part
 from torchrl_pomdp.trainers.peers import compare_peers
 from torchrl_pomdp.trainers.plan import Evaluate, Improve
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
+from torchrl_pomdp.trainers.ppo import ppo
 from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt, r_t
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "make_values",
     "papi_nt",
     "papi_t",
+    "ppo",
     "r_nt",
     "r_t",
     "save_checkpoint",

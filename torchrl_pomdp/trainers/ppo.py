@@ -1,0 +1,250 @@
+r"""Proximal policy optimisation with masked controls: a peer that policy iteration is compared with (paper, Section VI-D).
+
+It sees what policy iteration sees, the feature state with its legal controls, in networks of the same sizes, but looks ahead
+nowhere: it learns from trajectories of its own policy alone. Environment, distribution, advantages and loss are TorchRL's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import StepCounter, TransformedEnv
+from torchrl.modules import MaskedCategorical, ProbabilisticActor
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from torchrl_pomdp.checks import check_flag, check_instance, check_integer, check_seed
+from torchrl_pomdp.config import PolicyIterationConfig
+from torchrl_pomdp.envs.belief_env import BeliefEnv
+from torchrl_pomdp.modules import PolicyNetwork, ValueNetwork
+from torchrl_pomdp.modules.networks import LocalNetwork
+from torchrl_pomdp.modules.threads import kept_threads
+from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.progress import progress_bar
+from torchrl_pomdp.trainers.architecture import make_networks, make_values
+
+__all__ = ["ppo"]
+
+# Episodes side by side, and stages of each between two updates.
+_EPISODES, _STAGES = 256, 16
+BATCH = _EPISODES * _STAGES
+_MOST = 10**12
+
+_EPOCHS, _MINIBATCH = 4, 512
+_LEARNING_RATE, _LARGEST_GRADIENT = 5e-4, 0.5
+_CLIP, _LAMBDA, _ENTROPY = 0.2, 0.95, 0.02
+# The last layers begin that much smaller: a nearly uniform policy, and values near zero, whose noise would drown stage costs.
+_SHRINK = 0.01
+
+
+def ppo(problem: Problem, *, steps: int, seed: int = 0, progress: bool = False) -> PolicyNetwork:
+    r"""Train a policy by proximal policy optimisation (Schulman et al., 2017) on the belief steps of its own trajectories.
+
+    Rewards are minus expected stage costs; controls are drawn from a softmax over the legal ones. An episode ends in a terminal
+    state, or is cut after ``model.horizon`` stages, and then the value of the state where it is cut stands for what follows.
+    The first episodes begin as if they had run for different times already; otherwise all would be in the same stage at the
+    same time, and each update would forget the others. Costs span many orders of magnitude, so rewards are not scaled by one
+    number: advantages and the targets of values are taken in multiples of their state's pessimistic cost, as by
+    :class:`~torchrl_pomdp.objectives.ValueLoss`.
+
+    256 episodes run side by side. After every 16 stages an update makes 4 passes over these 4096 steps in minibatches of 512,
+    by Adam with a step size that falls from 0.0005 to 0, gradients of norm 0.5 at most, ratios clipped at 0.2, advantages with
+    :math:`\lambda=0.95`, and an entropy bonus that falls from 0.02 to 0. The networks are those of the default
+    :class:`~torchrl_pomdp.trainers.PolicyIterationConfig` with the problem's encoder, one of each for all parts. The seed alone
+    decides the result; PyTorch's global generators are left as they were.
+
+    Args:
+        problem: the problem; its partition is not used.
+
+    Keyword Args:
+        steps: belief steps of all episodes together; a last batch that is not full is left out.
+        seed: seed of weights, start states, observations, controls and minibatches.
+        progress: whether to show a progress bar with the rate.
+
+    Returns:
+        the policy that takes the most probable legal control. At feature states ``[*B]`` it writes ``"logits"`` ``[*B, U]`` and
+        ``"action"``, int64 ``[*B]``.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if there are fewer than 4096 steps, or the seed is out of range.
+
+    Examples:
+        >>> from torchrl_pomdp.evaluation import discounted_costs
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> problem = make_problem("tiger")
+        >>> policy = ppo(problem, steps=8192)
+        >>> discounted_costs(problem.model, policy, problem.start, num_states=100).shape
+        torch.Size([100])
+    """
+    problem = check_instance("problem", problem, Problem).unpartitioned()
+    steps, seed = check_integer("steps", steps, BATCH, _MOST), check_seed("seed", seed)
+    batches = steps // BATCH
+    bar = progress_bar(batches * BATCH, "step", "PPO", check_flag("progress", progress))
+    # Sums of gradients would depend on the number of threads.
+    with bar, seeded(problem.model.device, seed), kept_threads(1):
+        training = Training(problem, batches, seed)
+        for batch in training.batches():
+            training.update(batch)
+            bar.update(BATCH)
+    return training.policy.eval()
+
+
+@contextmanager
+def seeded(device: torch.device, seed: int) -> Iterator[None]:
+    """Seed the global generators, from which TorchRL draws controls, and restore them afterwards."""
+    accelerated = device.type == "cuda"
+    with torch.random.fork_rng([device] if accelerated else []):
+        torch.default_generator.manual_seed(seed)
+        if accelerated:
+            with torch.cuda.device(device):
+                torch.cuda.manual_seed(seed)
+        yield
+
+
+class Training:
+    """Networks, environment and loss of a training.
+
+    Args:
+        problem: a problem of a single part.
+        count: number of batches.
+        seed: seed of weights and environment.
+    """
+
+    def __init__(self, problem: Problem, count: int, seed: int) -> None:
+        model, config = problem.model, PolicyIterationConfig()
+        self.policy = cast(PolicyNetwork, make_networks(problem, config, seed).policies[0])
+        self.value = cast(ValueNetwork, make_values(problem, config, seed, self.policy.encoder).values[0])
+        for network in (self.policy, self.value):
+            _shrink(network)
+        self.actor = ProbabilisticActor(
+            _Logits(self.policy),
+            in_keys={"logits": "logits", "mask": "action_mask"},
+            out_keys=["action"],
+            distribution_class=MaskedCategorical,
+            return_log_prob=True,
+        )
+        env = BeliefEnv(model, problem.start, batch_size=(_EPISODES,), seed=seed)
+        self.env = TransformedEnv(env, _SpreadCounter(max_steps=model.horizon))
+        self.advantage = GAE(
+            gamma=model.discount, lmbda=_LAMBDA, value_network=_Critic(self.value), deactivate_vmap=True, device=model.device
+        )
+        self.loss = ClipPPOLoss(
+            self.actor,
+            _Critic(self.value, relative=True),
+            clip_epsilon=_CLIP,
+            entropy_coeff=_ENTROPY,
+            critic_coeff=1.0,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+        )
+        self.parameters = list(self.loss.parameters())
+        self.optimizer = torch.optim.Adam(self.parameters, _LEARNING_RATE)
+        self.schedule = torch.optim.lr_scheduler.LinearLR(self.optimizer, 1.0, 0.0, total_iters=count)
+        self.count = count
+
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Steps of the policy as it is, ``[episodes, stages]``."""
+        collector = Collector(
+            self.env,
+            self.actor,
+            frames_per_batch=BATCH,
+            total_frames=self.count * BATCH,
+            auto_register_policy_transforms=False,
+        )
+        try:
+            yield from collector
+        finally:
+            collector.shutdown()
+
+    def update(self, batch: TensorDictBase) -> None:
+        """Improve both networks on a batch."""
+        rows = self.labelled(batch)
+        for _ in range(_EPOCHS):
+            for chosen in torch.randperm(len(rows), device=rows.device).split(_MINIBATCH):
+                losses = self.loss(rows[chosen])
+                self.optimizer.zero_grad()
+                (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
+                nn.utils.clip_grad_norm_(self.parameters, _LARGEST_GRADIENT)
+                self.optimizer.step()
+        self.schedule.step()
+        self.loss.entropy_coeff.fill_(_ENTROPY * self.schedule.get_last_lr()[0] / _LEARNING_RATE)
+
+    def labelled(self, batch: TensorDictBase) -> TensorDictBase:
+        """The steps ``[N]`` with advantages and targets of values, in multiples of the states' pessimistic costs."""
+        with torch.no_grad():
+            self.advantage(batch)
+            unit = _unit(self.value, batch).unsqueeze(-1)
+        for key in ("advantage", "value_target"):
+            batch.set(key, batch.get(key) / unit)
+        read = [*self.policy.in_keys, *self.value.in_keys, "action", "action_log_prob", "advantage", "value_target"]
+        return batch.select(*read).reshape(-1)
+
+
+def _shrink(network: LocalNetwork) -> None:
+    """Make the weights of the last layer smaller."""
+    with torch.no_grad():
+        for parameter in network.network[-1].parameters():
+            parameter.mul_(_SHRINK)
+
+
+def _unit(network: ValueNetwork, y: TensorDictBase) -> Tensor:
+    """Pessimistic costs ``[*B]``; 1 where nothing can be multiples of them, in terminal start states."""
+    costs = network.scale.costs(y)
+    return costs.masked_fill(costs == 0, 1.0)
+
+
+class _SpreadCounter(StepCounter):
+    """Cuts episodes; the first ones begin as if they had run for different times already, evenly spread."""
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        first = tensordict.get("_reset", None) is None
+        result = super()._reset(tensordict, tensordict_reset)
+        if first:
+            count = result.get("step_count")
+            spread = torch.arange(len(count), device=count.device) * self.max_steps // len(count)
+            result.set("step_count", spread.view_as(count))
+        return result
+
+
+class _Logits(TensorDictModuleBase):
+    """A policy network without its control: TorchRL draws none where a module has written one."""
+
+    out_keys = ["logits"]
+
+    def __init__(self, network: PolicyNetwork) -> None:
+        super().__init__()
+        self.network, self.in_keys = network, network.in_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"logits"``."""
+        return tensordict.set("logits", self.network(tensordict.select(*self.in_keys)).get("logits"))
+
+
+class _Critic(TensorDictModuleBase):
+    """A value network as TorchRL reads it: ``"state_value"`` ``[*B, 1]`` is minus a cost.
+
+    Args:
+        network: the value network.
+        relative: whether the value is in multiples of the state's pessimistic cost.
+    """
+
+    out_keys = ["state_value"]
+
+    def __init__(self, network: ValueNetwork, *, relative: bool = False) -> None:
+        super().__init__()
+        self.network, self.relative, self.in_keys = network, relative, network.in_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"state_value"``."""
+        cost = self.network(tensordict.select(*self.in_keys)).get("state_value")
+        if self.relative:
+            cost = cost / _unit(self.network, tensordict)
+        return tensordict.set("state_value", -cost.unsqueeze(-1))
