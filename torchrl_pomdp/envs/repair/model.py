@@ -77,7 +77,7 @@ class RepairModel(Robots):
     chain: Tensor
     costs: Tensor
     destinations: Tensor
-    legal_when_intact: Tensor
+    _legal_when_intact: Tensor
     first_controls: Tensor
     _levels: Tensor
 
@@ -127,7 +127,7 @@ class RepairModel(Robots):
             # [L, A]: location after a robot's control, -1 where the move leaves the graph.
             "destinations": destinations,
             # [L, A]: legal controls of a robot whose location is known to be intact.
-            "legal_when_intact": torch.cat([~moves.any(-1, keepdim=True), moves], -1),
+            "_legal_when_intact": torch.cat([~moves.any(-1, keepdim=True), moves], -1),
             "first_controls": self.graph.first_controls,
             "_levels": torch.arange(self.num_levels).unsqueeze(-1),
         }
@@ -191,7 +191,7 @@ class RepairModel(Robots):
     def action_mask(self, y: TensorDictBase) -> Tensor:
         """Legal joint controls, bool ``[*B, U]``: every robot's control is legal for it."""
         belief, location = y.get("belief"), y.get("location")
-        robots = self.legal_when_intact.index_select(0, location.flatten()).unflatten(0, location.shape)
+        robots = self._legal_when_intact.index_select(0, location.flatten()).unflatten(0, location.shape)
         robots[..., REPAIR] |= belief[..., 0].gather(-1, location) < 1.0
         mask = robots[..., 0, :]
         for robot in range(1, self.num_robots):
@@ -209,7 +209,7 @@ class RepairModel(Robots):
             ([[False, False, True]], [[True, False, True]])
         """
         other = copy.copy(self)
-        other._buffers = {**self._buffers, "legal_when_intact": self.destinations >= 0}
+        other._buffers = {**self._buffers, "_legal_when_intact": self.destinations >= 0}
         return other
 
     # ---- the model -----------------------------------------------------------------------------------------------
