@@ -47,7 +47,7 @@ def test_decisions_do_not_depend_on_the_batch(make, linear20):
 
 
 def test_copies_decide_alike(make, line3):
-    search = make(line3.model, GreedyRepair(line3.model))
+    search = make(line3.model, UrgencyRepair(line3.model))
     y = line3.start(torch.arange(3))
     first = search(y.clone())["q_factors"]
     for other in (copy.deepcopy(search), pickle.loads(pickle.dumps(search))):
@@ -83,7 +83,7 @@ def test_more_than_what_is_legal_can_be_searched(make, line3):
 
 def test_a_terminal_state_asks_for_anything_legal(make, line3):
     y = line3.start(torch.arange(1)).set("belief", torch.eye(5)[:1].expand(1, 3, 5))
-    decided = make(line3.model, GreedyRepair(line3.model))(y)
+    decided = make(line3.model, UrgencyRepair(line3.model))(y)
     line3.model.check_controls(y, decided["action"])
     assert decided["q_factors"][0, decided["action"]] == 0.0
 

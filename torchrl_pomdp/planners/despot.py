@@ -2,6 +2,7 @@ r"""DESPOT: determinized sparse partially observable trees (Somani, Ye, Hsu & Le
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +20,8 @@ __all__ = ["DESPOT"]
 
 # Nodes that a tree starts with, beside those of the root's children; and entries of its lists of scenarios for each.
 _NODES, _SHARES = 256, 8
+# Bounds that are so close, relative to them, are one.
+_CLOSED = 1e-9
 
 
 class DESPOT(TreeSearch):
@@ -102,30 +105,56 @@ class DESPOT(TreeSearch):
         return found[..., -2], found[..., -1]
 
     def _decide(self, roots: Roots, number: int, found: NDArray[np.float64]) -> int:
-        from torchrl_pomdp.planners.despot_loop import CROSSED, FULL, ILLEGAL, Options, explore
+        from torchrl_pomdp.planners.despot_loop import OVER, Options, answer, expand, walk
 
-        state, tree, done, steps = roots.state(number), self._tree(roots.width), 0, 0
-        options = Options(
-            self.scenarios, self.depth, self.regularisation, self.gap, self.model.discount, self.bound == "relaxed"
-        )
-        memory = np.empty(self.scenarios, np.int64)
-        for more in self.budget.stretches():
-            last = done + more
-            while done < last:
-                args = roots.model, roots.policy, state, tree, memory, roots.keys[number], done, last - done, options
-                done, made, how = self.call(explore, *args, roots.least, found[:-2])
-                self.check_legal(how != ILLEGAL)
-                if how == CROSSED:
-                    raise RuntimeError("a lower bound of the cost exceeds an upper one: the relaxation of the model is wrong")
-                steps += made
-                if how == FULL:
-                    tree = self._grown(tree)
+        tight = self.bound == "relaxed"
+        options = Options(self.scenarios, self.depth, self.regularisation, self.gap, self.model.discount, tight)
+        state, memory, key = roots.state(number), np.empty(self.scenarios, np.int64), roots.keys[number]
+        tree, steps = self._tree(roots.width), 0
+
+        def grow(node: int) -> int:
+            made, how = self.call(expand, roots.model, roots.policy, state, tree, memory, key, node, options, roots.least)
+            self._check(how)
+            return int(made)
+
+        def explore() -> int:
+            nonlocal tree
+            node, made = OVER, 0
+            while True:
+                node, crossed = self.call(walk, tree, node, options)
+                self._check_bounds(crossed)
+                if node == OVER:
+                    return made
+                tree = self._with_room(tree, node)
+                made += grow(node)
+
+        steps += grow(OVER)
+        for _ in chain.from_iterable(map(range, self.budget.stretches())):
+            if tree.upper[0] - tree.lower[0] <= _CLOSED * abs(tree.upper[0]) and not tree.open[0]:
+                break
+            steps += explore()
+        if not tree.ended[0]:
+            self.call(answer, tree, options, found[:-2])
         found[-2:] = tree.lower[0], tree.upper[0]
         return steps
 
-    def _grown(self, tree: Any) -> Any:
-        """The same tree with room for twice as much."""
-        return type(tree)(tree.size, *(grown(each) for each in tree[1:]))
+    def _check(self, how: int) -> None:
+        from torchrl_pomdp.planners.despot_loop import CROSSED, ILLEGAL
+
+        self.check_legal(how != ILLEGAL)
+        self._check_bounds(how == CROSSED)
+
+    def _check_bounds(self, crossed: bool) -> None:
+        if crossed:
+            raise RuntimeError("a lower bound of the cost exceeds an upper one: the relaxation of the model is wrong")
+
+    def _with_room(self, tree: Any, node: int) -> Any:
+        """The tree with room for the children of a node, however many."""
+        most = int(tree.counts[node]) * self.model.num_controls
+        while tree.size[0] + most > len(tree.counts) or tree.size[1] + most > len(tree.members):
+            size, chosen, *arrays = tree
+            tree = type(tree)(size, chosen, *(grown(each) for each in arrays))
+        return tree
 
     def _tree(self, width: int) -> Any:
         from torchrl_pomdp.planners.despot_loop import Despot
@@ -135,6 +164,7 @@ class DESPOT(TreeSearch):
         whole, real, flags = (_zeros(nodes, kind) for kind in (np.int64, np.float64, np.bool_))
         return Despot(
             size=np.zeros(2, np.int64),
+            chosen=np.zeros(1, np.int64),
             rows=real(width),
             seen=np.zeros(nodes, np.uint64),
             parents=whole(),

@@ -28,10 +28,12 @@ from torchrl_pomdp.scalar.models import (
 )
 from torchrl_pomdp.scalar.noise import Noise, fold
 
-__all__ = ["CROSSED", "DONE", "FULL", "ILLEGAL", "Despot", "Options", "explore"]
+__all__ = ["CROSSED", "FINE", "ILLEGAL", "OVER", "Despot", "Options", "answer", "expand", "walk"]
 
-# How a call ends: as planned, the tree is full, the base policy chose an illegal control, or a lower bound exceeds an upper.
-DONE, FULL, ILLEGAL, CROSSED = range(4)
+# How a call of expand ends.
+FINE, ILLEGAL, CROSSED = range(3)
+# What walk gives in place of a node: the exploration is over.
+OVER = -1
 # What rounding may do to bounds, relative to them.
 _ROUNDING = 1e-9
 
@@ -52,6 +54,7 @@ class Despot(NamedTuple):
 
     Attributes:
         size: numbers of nodes and of entries of ``members`` in use, ``[2]``.
+        chosen: control of the base policy at the root, ``[1]``.
         rows: states of the model, ``[N, W]``.
         seen: variables that its scenarios have seen, ``[N]``.
         parents: ``[N]``.
@@ -72,6 +75,7 @@ class Despot(NamedTuple):
     """
 
     size: NDArray[np.int64]
+    chosen: NDArray[np.int64]
     rows: NDArray[np.float64]
     seen: NDArray[np.uint64]
     parents: NDArray[np.int64]
@@ -109,7 +113,7 @@ def _evaluate(model, policy, state, tree, node, key, options, least):
     tree.open[node], steps = not tree.ended[node], 0
     if tree.ended[node]:
         tree.base[node], tree.lower[node], tree.upper[node], tree.gaps[node] = 0.0, 0.0, 0.0, 0.0
-        return steps, DONE
+        return steps, FINE
     mask(model, state, tree.legal[node])
     weight, seen = _weight(tree, node, options), tree.seen[node]
     low, high = 0.0, 0.0
@@ -130,7 +134,7 @@ def _evaluate(model, policy, state, tree, node, key, options, least):
     tree.base[node], tree.upper[node] = weight * high, weight * high
     tree.gaps[node] = max(weight * (high - low), 0.0)
     tree.lower[node] = min(weight * low + options.regularisation, weight * high)
-    return steps, DONE
+    return steps, FINE
 
 
 @shared
@@ -167,28 +171,65 @@ def _branch(model, state, tree, node, u, key, options, numbers):
 
 
 @shared
-def _expand(model, policy, state, tree, node, key, options, least, numbers):
-    """Give a node its children by all legal controls."""
-    steps, weight = 0, _weight(tree, node, options) * tree.counts[node]
-    tree.open[node] = False
-    recall(model, state, tree.rows[node])
-    costs(model, state, tree.costs[node])
-    for u in range(tree.legal.shape[1]):
-        tree.branches[node, u], tree.children[node, u] = 0, tree.size[0]
-        tree.costs[node, u] *= weight
-        if not tree.legal[node, u]:
-            continue
-        tree.branches[node, u] = _branch(model, state, tree, node, u, key, options, numbers)
-        for child in range(tree.children[node, u], tree.size[0]):
+def _plant(model, policy, state, tree, options):
+    """Put the root, with all scenarios, into the tree."""
+    start(model, state)
+    tree.chosen[0] = preferred(model, policy, state)
+    start(model, state)
+    keep(model, state, tree.rows[0])
+    tree.size[0], tree.size[1], tree.parents[0], tree.depths[0], tree.seen[0] = 1, options.scenarios, -1, 0, np.uint64(0)
+    tree.first[0], tree.counts[0] = 0, options.scenarios
+    for member in range(options.scenarios):
+        tree.members[member] = member
+
+
+@outer
+def expand(model, policy, state, tree, numbers, key, node, options, least):
+    """Give a node its children by all legal controls; there is room for them. The tree of no nodes gets its root.
+
+    Args:
+        model: scalar model.
+        policy: base policy, pair of twin and data.
+        state: of the model, with the root in it.
+        tree: the tree.
+        numbers: memory, int64 ``[K]``.
+        key: of the root, unsigned.
+        node: the node; -1 for the root of an empty tree.
+        options: of the search.
+        least: a cost below that of any policy from any state; the lower bound unless ``options.tight``.
+
+    Returns:
+        number of steps, and how it has ended.
+    """
+    steps, new = 0, tree.size[0]
+    if node < 0:
+        _plant(model, policy, state, tree, options)
+        if tree.chosen[0] < 0 and not over(model, state):
+            return steps, ILLEGAL
+    else:
+        weight = _weight(tree, node, options) * tree.counts[node]
+        tree.open[node] = False
+        recall(model, state, tree.rows[node])
+        costs(model, state, tree.costs[node])
+        for u in range(tree.legal.shape[1]):
+            tree.branches[node, u], tree.children[node, u] = 0, tree.size[0]
+            tree.costs[node, u] *= weight
+            if tree.legal[node, u]:
+                tree.branches[node, u] = _branch(model, state, tree, node, u, key, options, numbers)
+    u = 0
+    for child in range(new, tree.size[0]):
+        if node >= 0:
+            while child >= tree.children[node, u] + tree.branches[node, u]:
+                u += 1
             recall(model, state, tree.rows[node])
             move(model, state, u)
             settle(model, state, np.int64(tree.rows[child, 0]))
             keep(model, state, tree.rows[child])
-            more, how = _evaluate(model, policy, state, tree, child, key, options, least)
-            steps += more
-            if how != DONE:
-                return steps, how
-    return steps, DONE
+        more, how = _evaluate(model, policy, state, tree, child, key, options, least)
+        steps += more
+        if how != FINE:
+            return steps, how
+    return steps, FINE
 
 
 @inner
@@ -254,30 +295,29 @@ def _back_up(tree, node, options):
     return False
 
 
-@inner
-def _fits(tree, node):
-    """Whether there is room for the children of a node, however many."""
-    most = tree.counts[node] * tree.legal.shape[1]
-    return tree.size[0] + most <= len(tree.counts) and tree.size[1] + most <= len(tree.members)
+@outer
+def walk(tree, node, options):
+    """Go down from the root, or on from a node that has just got its children, to a node that shall get some.
 
+    Args:
+        tree: the tree; its bounds are brought up to date.
+        node: the node, or -1 to begin at the root.
+        options: of the search.
 
-@shared
-def _grow(model, policy, state, tree, key, options, least, numbers):
-    """One exploration from the root; the tree stays as it is where it is full."""
-    node, steps = 0, 0
+    Returns:
+        the node, or :data:`OVER`; and whether a lower bound exceeds an upper one.
+    """
+    if node >= 0 and _back_up(tree, node, options):
+        return OVER, True
+    node = max(node, 0)
     while True:
         if tree.open[node]:
-            if tree.depths[node] >= options.depth or _blocked(tree, node, options):
-                _close(tree, node)
-                return steps, DONE if node == 0 or not _back_up(tree, tree.parents[node], options) else CROSSED
-            if not _fits(tree, node):
-                return steps, FULL
-            more, how = _expand(model, policy, state, tree, node, key, options, least, numbers)
-            steps += more
-            if how != DONE:
-                return steps, how
-            if _back_up(tree, node, options):
-                return steps, CROSSED
+            if tree.depths[node] < options.depth and not _blocked(tree, node, options):
+                return node, False
+            _close(tree, node)
+            return OVER, node > 0 and _back_up(tree, tree.parents[node], options)
+        if tree.ended[node]:
+            return OVER, False
         u, _ = _best(tree, node, tree.lower, options)
         following, most = -1, 0.0
         for child in range(tree.children[node, u], tree.children[node, u] + tree.branches[node, u]):
@@ -285,65 +325,15 @@ def _grow(model, policy, state, tree, key, options, least, numbers):
             if excess > most:
                 following, most = child, excess
         if following < 0:
-            return steps, DONE
+            return OVER, False
         node = following
 
 
-@shared
-def _plant(model, policy, state, tree, key, options, least):
-    """The root, with all scenarios."""
-    start(model, state)
-    keep(model, state, tree.rows[0])
-    tree.size[0], tree.size[1], tree.parents[0], tree.depths[0], tree.seen[0] = 1, options.scenarios, -1, 0, np.uint64(0)
-    tree.first[0], tree.counts[0] = 0, options.scenarios
-    for member in range(options.scenarios):
-        tree.members[member] = member
-    return _evaluate(model, policy, state, tree, 0, key, options, least)
-
-
 @outer
-def explore(model, policy, state, tree, numbers, key, done, more, options, least, q):
-    """Explorations from the root, and what is known of its controls after them.
-
-    Args:
-        model: scalar model.
-        policy: base policy, pair of twin and data.
-        state: of the model, with the root in it.
-        tree: the tree; empty before the first call.
-        numbers: memory, int64 ``[K]``.
-        key: of the root, unsigned.
-        done: explorations so far.
-        more: explorations to make.
-        options: of the search.
-        least: a cost below that of any policy from any state; the lower bound unless ``options.tight``.
-        q: gets the cost of each control in the best policy tree that starts with it, ``[U]``; not set for a terminal root.
-
-    Returns:
-        number of explorations so far, of steps, and how the call has ended; fewer explorations where the gap is closed.
-    """
-    steps, last = 0, done + more
-    if tree.size[0] == 0:
-        made, how = _plant(model, policy, state, tree, key, options, least)
-        steps += made
-        if how != DONE:
-            return done, steps, how
-    if tree.ended[0]:
-        return last, steps, DONE
-    while done < last:
-        made, how = _grow(model, policy, state, tree, key, options, least, numbers)
-        steps += made
-        if how != DONE:
-            return done, steps, how
-        done += 1
-        if tree.upper[0] - tree.lower[0] <= _ROUNDING * abs(tree.upper[0]):
-            done = last
+def answer(tree, options, q):
+    """Put into ``q`` ``[U]`` the cost of each legal control of a root with children, in the best tree that starts with it."""
     for u in range(len(q)):
         if tree.legal[0, u]:
             q[u] = tree.costs[0, u] + options.regularisation + _through(tree, 0, u, tree.upper)
-    recall(model, state, tree.rows[0])
-    chosen = preferred(model, policy, state)
-    if chosen < 0:
-        return done, steps, ILLEGAL
     # The base policy is one way to go on after its own control.
-    q[chosen] = min(q[chosen], tree.base[0])
-    return done, steps, DONE
+    q[tree.chosen[0]] = min(q[tree.chosen[0]], tree.base[0])

@@ -24,6 +24,8 @@ from torchrl_pomdp.modules.threads import map_threads
 
 __all__ = ["Budget", "TreeSearch"]
 
+# What a copy does not take along, nor a file.
+_OWN = {"_lock", "_loops", "engine", "simulated_steps"}
 # Most simulations of a decision.
 _MOST = 10**9
 
@@ -110,11 +112,11 @@ class TreeSearch(TensorDictModuleBase):
         self.budget = Budget(simulations, seconds)
         self.max_steps = check_integer("max_steps", model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
         self.seed = check_integer("seed", seed)
-        self.simulated_steps = 0
         self._prepare()
 
     def _prepare(self) -> None:
         """What a copy makes for itself."""
+        self.simulated_steps = 0
         self._lock, self.engine = Lock(), self._engine()
         self._loops: Any = None
 
@@ -173,8 +175,8 @@ class TreeSearch(TensorDictModuleBase):
             raise ValueError("base_policy chose an illegal control in a simulation; its scalar twin must choose a legal one")
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the lock and the compiled loop: a copy makes its own."""
-        return {key: value for key, value in self.__dict__.items() if key not in {"_lock", "_loops", "engine"}}
+        """All but the lock, the compiled loops and the count: a copy starts its own."""
+        return {key: value for key, value in self.__dict__.items() if key not in _OWN}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """The inverse of :meth:`__getstate__`."""

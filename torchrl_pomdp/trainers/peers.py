@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from statistics import median
@@ -51,13 +50,15 @@ _BLOCK = 10
 _TIMED = 15
 # Most trajectories of an online decision; its time ends it.
 _TRAJECTORIES = 4096
+# Most scenarios of DESPOT, as its authors have them.
+_SCENARIOS = 500
 
 
 @dataclass(frozen=True)
 class _Peer:
-    """A method: how its policy is made, and whether it may do all that can be carried out."""
+    """A method's policy, and whether it may do all that can be carried out."""
 
-    make: Callable[[], Policy]
+    policy: Policy
     unrestricted: bool = False
 
 
@@ -117,11 +118,12 @@ def compare_peers(
             raise ValueError(f"checkpoint must be of the problem {problem.name}, got one of {checkpoint.problem.name}")
     if ppo_steps is not None:
         check_integer("ppo_steps", ppo_steps, 1)
+    # Whatever cannot be made is refused before anything is written.
+    peers = _peers(problem, checkpoint, seconds)
     found = {"problem": problem_digest(problem), "seconds": seconds, "seed": seed}
     path = open_run_folder(check_path("folder", folder), found)
-    peers = _peers(problem, checkpoint, seconds)
     if ppo_steps is not None:
-        peers["PPO"] = _Peer(partial(_trained_ppo, problem, path, ppo_steps, seed, progress))
+        peers["PPO"] = _Peer(_trained_ppo(problem, path, ppo_steps, seed, progress))
     execution = _Execution(problem, path, states, seed, progress)
     outcomes: dict[str, Outcome] = {}
     for name, peer in peers.items():
@@ -131,28 +133,30 @@ def compare_peers(
 
 
 def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> dict[str, _Peer]:
-    """The methods by name, made when they are asked for."""
+    """The methods by name, but for PPO."""
     model, bases = problem.model, problem.base_policies
     base_name, base = list(bases.items())[-1]
     online: dict[str, Any] = {"trajectories": _TRAJECTORIES, "allocation": "adaptive", "seconds": seconds}
-    peers = {name: _Peer(partial(_given, policy)) for name, policy in bases.items()}
-    peers[f"R-NT of {base_name}"] = _Peer(partial(RolloutPolicy, model, base, **online))
+    peers = {name: _Peer(policy) for name, policy in bases.items()}
+    peers[f"R-NT of {base_name}"] = _Peer(RolloutPolicy(model, base, **online))
     if checkpoint is not None:
         if len(problem.partition.stages) > 1:
-            peers[f"R-T of {base_name}"] = _Peer(partial(r_t, problem, base, checkpoint.value, **online))
-        peers[checkpoint.name] = _Peer(partial(_given, checkpoint.policy))
-        peers[f"{checkpoint.name} + R-NT"] = _Peer(partial(RolloutPolicy, model, checkpoint.policy, **online))
+            peers[f"R-T of {base_name}"] = _Peer(r_t(problem, base, checkpoint.value, **online))
+        peers[checkpoint.name] = _Peer(checkpoint.policy)
+        peers[f"{checkpoint.name} + R-NT"] = _Peer(RolloutPolicy(model, checkpoint.policy, **online))
     for search in (POMCP, DESPOT):
         everything, name = model.unrestricted(), search.__name__
-        bound: dict[str, Any] = {"bound": "trivial"} if search is DESPOT else {}
-        peers[f"{name} orig"] = _Peer(partial(search, everything, None, seconds=seconds, **bound), unrestricted=True)
-        peers[f"{name} mod"] = _Peer(partial(search, model, None, seconds=seconds, **bound))
-        peers[f"{name} fair"] = _Peer(partial(search, model, base, seconds=seconds))
+        options: dict[str, Any] = {"scenarios": _scenarios(seconds)} if search is DESPOT else {}
+        box: dict[str, Any] = options | ({"bound": "trivial"} if search is DESPOT else {})
+        peers[f"{name} orig"] = _Peer(search(everything, None, seconds=seconds, **box), unrestricted=True)
+        peers[f"{name} mod"] = _Peer(search(model, None, seconds=seconds, **box))
+        peers[f"{name} fair"] = _Peer(search(model, base, seconds=seconds, **options))
     return peers
 
 
-def _given(policy: Policy) -> Policy:
-    return policy
+def _scenarios(seconds: float) -> int:
+    """Scenarios that DESPOT has time for: the root alone takes a simulation of each for every control."""
+    return min(_SCENARIOS, max(10, round(10_000 * seconds)))
 
 
 def _trained_ppo(problem: Problem, folder: Path, steps: int, seed: int, progress: bool) -> Policy:
@@ -191,15 +195,16 @@ class _Execution:
 
     def outcome(self, name: str, peer: _Peer) -> Outcome:
         """A method's costs, from the folder as far as they are there."""
-        policy = peer.make()
-        blocks = list(self._blocks(name, peer, policy))
+        policy = peer.policy
+        blocks = list(self._blocks(name, peer))
         costs = torch.cat([block["costs"] for block in blocks])
         if self._baseline is None:
             self._baseline = costs
         decisions, steps = (sum(block[key] for block in blocks) for key in ("decisions", "steps"))
         return Outcome(compare(costs, self._baseline), self._time(name, policy), steps / max(decisions, 1))
 
-    def _blocks(self, name: str, peer: _Peer, policy: Policy) -> Iterator[dict[str, Any]]:
+    def _blocks(self, name: str, peer: _Peer) -> Iterator[dict[str, Any]]:
+        policy = peer.policy
         model = self.problem.model.unrestricted() if peer.unrestricted else self.problem.model
         owner = digest([problem_digest(self.problem), name, policy, self.seed])
         for first in range(0, self.states, _BLOCK):

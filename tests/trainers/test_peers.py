@@ -1,0 +1,155 @@
+"""All methods beside each other: which, from which states, kept and gone on with."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from torchrl_pomdp import cli
+from torchrl_pomdp.modules import PartitionedValue
+from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.trainers import Checkpoint, PolicyIterationConfig, compare_peers, make_networks, make_values, peers
+from torchrl_pomdp.trainers.checkpoint import problem_digest, save_checkpoint
+
+SEARCHES = [f"{name} {mode}" for name in ("POMCP", "DESPOT") for mode in ("orig", "mod", "fair")]
+LEARNT = ["R-T of urgency", "pAPI-NT 1", "pAPI-NT 1 + R-NT"]
+
+
+@pytest.fixture(scope="module")
+def checkpoint(line3):
+    config = PolicyIterationConfig(hidden=(8,), value_hidden=(8,))
+    policy = make_networks(line3, config, 0).eval()
+    value = PartitionedValue(list(make_values(line3, config, 0).values)).eval()
+    return Checkpoint(line3, config, "pAPI-NT", 1, policy, value)
+
+
+@pytest.fixture(scope="module")
+def folder(line3, checkpoint, tmp_path_factory):
+    """A comparison that has been carried out, and its outcomes."""
+    path = tmp_path_factory.mktemp("peers") / "run"
+    outcomes = compare_peers(line3, path, checkpoint=checkpoint, states=3, seconds=0.001)
+    return path, outcomes
+
+
+def test_every_method_is_there(folder):
+    _, outcomes = folder
+    assert list(outcomes) == ["greedy", "urgency", "R-NT of urgency", *LEARNT, *SEARCHES]
+    for name, outcome in outcomes.items():
+        assert outcome.comparison.cost.count == 3
+        assert outcome.seconds > 0.0
+        assert (outcome.steps == 0.0) == (name in ("greedy", "urgency", "pAPI-NT 1")), name
+    assert outcomes["greedy"].comparison.ratio.mean == 1.0
+
+
+def test_it_goes_on_where_it_stopped(line3, folder, checkpoint, monkeypatch):
+    path, outcomes = folder
+    evaluated = []
+
+    def watched(model, policy, start, *, num_states, first, **options):
+        evaluated.append((first, num_states))
+        return torch.full((num_states,), 100.0)
+
+    monkeypatch.setattr(peers, "discounted_costs", watched)
+    again = compare_peers(line3, path, checkpoint=checkpoint, states=3, seconds=0.001)
+    assert evaluated == []
+    assert {name: outcome.to_dict() for name, outcome in again.items()} == {n: o.to_dict() for n, o in outcomes.items()}
+    # Only what was lost is made again.
+    (path / "urgency" / "0000000-3.pt").unlink()
+    again = compare_peers(line3, path, checkpoint=checkpoint, states=3, seconds=0.001)
+    assert evaluated == [(0, 3)]
+    assert again["urgency"].comparison.cost.mean == 100.0
+
+
+def test_states_come_in_blocks_that_do_not_matter(line3, tmp_path, monkeypatch):
+    monkeypatch.setattr(peers, "_peers", lambda problem, *_: {"greedy": peers._Peer(GreedyRepair(problem.model))})
+    whole = compare_peers(line3, tmp_path / "whole", states=7, seconds=0.001)
+    monkeypatch.setattr(peers, "_BLOCK", 2)
+    parts = compare_peers(line3, tmp_path / "parts", states=7, seconds=0.001)
+    assert parts["greedy"].comparison == whole["greedy"].comparison
+    assert len(list((tmp_path / "parts" / "greedy").glob("0*.pt"))) == 4
+
+
+def test_only_the_original_mode_may_do_everything(line3):
+    every = peers._peers(line3, None, 0.01)
+    for name, peer in every.items():
+        assert peer.unrestricted == name.endswith("orig")
+        if name in SEARCHES:
+            model = peer.policy.model
+            y = line3.start(torch.arange(1)).set("belief", torch.eye(5)[:1].expand(1, 3, 5))
+            assert bool(model.action_mask(y)[0, 0]) == name.endswith("orig")
+
+
+def test_ppo_is_trained_once(line3, tmp_path, monkeypatch):
+    trained = []
+
+    def fake(problem, *, steps, seed, progress):
+        trained.append((steps, seed))
+        return make_networks(problem.unpartitioned(), PolicyIterationConfig(), 5).policies[0].eval()
+
+    monkeypatch.setattr(peers, "ppo", fake)
+    y = line3.model.unrestricted().with_features(line3.start(torch.arange(20)))
+    logits = [peers._trained_ppo(line3, tmp_path, 100, 3, False)(y.clone())["logits"] for _ in range(2)]
+    assert trained == [(100, 3)]
+    assert torch.equal(*logits)
+    peers._trained_ppo(line3, tmp_path, 101, 3, False)
+    assert trained == [(100, 3), (101, 3)]
+
+
+def test_what_does_not_belong_is_refused(folder, line3, checkpoint, linear20, tmp_path):
+    path, _ = folder
+    before = sorted(path.rglob("*"))
+    with pytest.raises(ValueError, match="holds another run, which differs in seconds"):
+        compare_peers(line3, path, states=3, seconds=0.002)
+    with pytest.raises(ValueError, match="checkpoint must be of the problem linear20, got one of line3"):
+        compare_peers(linear20, tmp_path / "other", checkpoint=checkpoint)
+    with pytest.raises(ValueError, match=r"model must have a scalar twin.*RockSample"):
+        compare_peers(make_problem("rocksample7x8"), tmp_path / "rocks", states=2, seconds=0.001)
+    assert sorted(path.rglob("*")) == before
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_writes_table_and_pictures(line3, checkpoint, tmp_path, capsys, monkeypatch):
+    save_checkpoint(tmp_path / "best.pt", checkpoint)
+    parts = {"a": {"simulated_steps": 40}, "b": {"simulated_steps": 2}}
+    (tmp_path / "iterations.json").write_text(json.dumps([{"parts": parts}]))
+    given = []
+
+    def few(problem, folder, **options):
+        given.append(options)
+        some = {name: peers._peers(problem, None, 0.001)[name] for name in ("greedy", "urgency")}
+        monkeypatch.setattr(peers, "_peers", lambda *_: some)
+        return compare_peers(problem, folder, **(options | {"ppo_steps": None}))
+
+    monkeypatch.setattr("torchrl_pomdp.commands.compare_peers", few)
+    command = ["compare", "line3", "--checkpoint", str(tmp_path / "best.pt"), "--states", "3", "--seconds", "0.001"]
+    assert cli.main([*command, "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]) == 0
+    (options,) = given
+    assert options["ppo_steps"] == 42
+    assert problem_digest(options["checkpoint"].problem) == problem_digest(line3)
+    name = "compare-line3-0.001s"
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        f"{name}{end}" for end in (".json", ".md", ".png", "-time.png")
+    }
+    content = json.loads((tmp_path / "out" / f"{name}.json").read_text())
+    assert list(content["outcomes"]) == ["greedy", "urgency"]
+    shown = capsys.readouterr().out
+    assert "| greedy |" in shown
+    assert "pictures:" in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--states 1", "states must be at least 2, got 1"),
+        ("--seconds 0", "seconds must be"),
+        ("--checkpoint nowhere.pt", "nowhere.pt"),
+    ],
+)
+def test_the_command_refuses_nonsense(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["compare", "line3", *arguments.split()]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
