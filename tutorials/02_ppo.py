@@ -14,7 +14,8 @@
 # # PPO on a belief environment
 #
 # `BeliefEnv` is a TorchRL environment like any other. This is TorchRL's own PPO on it, as a baseline that knows nothing of the
-# model. `PolicyNetwork` is the actor: it writes `"logits"`, and the environment's `"action_mask"` says which controls are legal.
+# model. `PolicyNetwork.actor()` is the actor: it draws among the controls that the environment's `"action_mask"` says are legal.
+# `trainers.ppo` does the same with more care, for large problems.
 
 # %% tags=["parameters"]
 UPDATES = 60
@@ -28,7 +29,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import RewardScaling, TransformedEnv
-from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -43,12 +43,7 @@ problem = make_problem("line3")
 env = TransformedEnv(BeliefEnv(problem.model, problem.start, batch_size=(64,), seed=0), RewardScaling(0.0, 0.01))
 encoder, generator = FlatEncoder(problem.model), torch.Generator().manual_seed(0)
 policy = PolicyNetwork(encoder, problem.model.num_controls, (64, 64), generator=generator)
-actor = ProbabilisticActor(
-    policy,
-    in_keys={"logits": "logits", "mask": "action_mask"},
-    distribution_class=MaskedCategorical,
-    return_log_prob=True,
-)
+actor = policy.actor()
 
 
 class Critic(TensorDictModuleBase):

@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 from _oracles import random_states, small_model
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_pomdp.envs.repair import grid, line
 from torchrl_pomdp.modules import FlatEncoder, PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
@@ -137,3 +138,21 @@ def test_a_network_stays_in_its_models_type(linear20):
         with pytest.raises(ValueError, match=r"stays in the type torch\.float32"):
             convert()
     assert torch.equal(policy.to("cpu", torch.float32)(y.copy())["logits"], logits), "nothing was converted"
+
+
+def test_an_actor_draws_legal_controls_by_the_softmax_of_the_logits(linear20):
+    network = PolicyNetwork(RelativeEncoder(linear20.model), 3, (16,), generator=torch.Generator().manual_seed(1))
+    y = linear20.model.with_features(linear20.start(torch.arange(5)))
+    logits = network(y.clone())["logits"].masked_fill(~y["action_mask"], -torch.inf)
+    rows = y.repeat_interleave(4000).reshape(-1)
+    with torch.random.fork_rng(), set_exploration_type(ExplorationType.RANDOM):
+        torch.manual_seed(0)
+        drawn = network.actor()(rows)
+    counts = torch.zeros(5, 3).index_put_(
+        (torch.arange(5).repeat_interleave(4000), drawn["action"]), torch.ones(()), accumulate=True
+    )
+    probs = logits.softmax(-1)
+    assert bool((counts[~y["action_mask"]] == 0).all())
+    assert bool(((counts / 4000 - probs).abs() <= 4.5 * (probs * (1 - probs) / 4000).sqrt() + 1e-6).all())
+    exact = logits.log_softmax(-1).repeat_interleave(4000, 0).gather(-1, drawn["action"].unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(drawn["action_log_prob"], exact)

@@ -222,3 +222,16 @@ def test_without_numba_it_says_what_to_install(make, line3, monkeypatch):
     monkeypatch.setattr(tree_search, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"needs numba: pip install 'torchrl-pomdp\[fast\]'"):
         make(line3.model, None)
+
+
+def test_equal_bounds_at_the_root_are_answered(line3):
+    # One location is damaged, and the robot stands on it: repair is the only thing to do, and its cost is certain.
+    belief = torch.eye(5)[torch.tensor([4, 0, 0])].expand(1, 3, 5)
+    y = line3.start(torch.arange(1)).set("belief", belief).set("location", torch.zeros(1, 1, dtype=torch.int64))
+    search = DESPOT(line3.model, UrgencyRepair(line3.model), simulations=5, scenarios=7)
+    low, high = search.bounds(y)
+    assert float(low) == pytest.approx(100.0)
+    assert float(high) == pytest.approx(100.0)
+    decided = search(y.clone())
+    assert int(decided["action"]) == 0
+    assert float(decided["q_factors"][0, 0]) == pytest.approx(100.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,6 +20,9 @@ from torchrl_pomdp.modules.rowwise import RowLinear, rowwise
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, local_engine
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
 from torchrl_pomdp.tensor_checks import check_entries
+
+if TYPE_CHECKING:
+    from torchrl.modules import ProbabilisticActor
 
 __all__ = ["LocalNetwork", "PolicyNetwork", "ValueNetwork", "evaluate_networks"]
 
@@ -113,6 +116,45 @@ class PolicyNetwork(LocalNetwork):
         # One check for all: of NaN, of infinite logits, and of a state without a legal control.
         _check_finite("logits", best)
         return TensorDict({"logits": logits, "action": action}, y.batch_size)
+
+    def actor(self) -> ProbabilisticActor:
+        """The policy as an actor of TorchRL, which draws legal controls by the softmax of the logits; weights are shared.
+
+        The network itself takes the most probable control. Where a module writes an action, TorchRL's actors draw none: given
+        the network they would not explore.
+
+        Examples:
+            >>> from torchrl_pomdp.modules import FlatEncoder
+            >>> from torchrl_pomdp.problems import make_problem
+            >>> problem = make_problem("tiger")
+            >>> network = PolicyNetwork(FlatEncoder(problem.model), 3, (8,), generator=torch.Generator().manual_seed(0))
+            >>> y = network.actor()(problem.model.with_features(problem.start(torch.arange(5))))
+            >>> y["action_log_prob"].shape
+            torch.Size([5])
+        """
+        from torchrl.modules import MaskedCategorical, ProbabilisticActor
+
+        return ProbabilisticActor(
+            _Logits(self),
+            in_keys={"logits": "logits", "mask": "action_mask"},
+            out_keys=["action"],
+            distribution_class=MaskedCategorical,
+            return_log_prob=True,
+        )
+
+
+class _Logits(TensorDictModuleBase):
+    """A policy network without its control."""
+
+    out_keys = ["logits"]
+
+    def __init__(self, network: PolicyNetwork) -> None:
+        super().__init__()
+        self.network, self.in_keys = network, network.in_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"logits"``."""
+        return tensordict.set("logits", self.network(tensordict.select(*self.in_keys)).get("logits"))
 
 
 class ValueNetwork(LocalNetwork):

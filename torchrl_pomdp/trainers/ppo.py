@@ -16,7 +16,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import StepCounter, TransformedEnv
-from torchrl.modules import MaskedCategorical, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -126,13 +125,7 @@ class Training:
         self.value = cast(ValueNetwork, make_values(problem, config, seed, self.policy.encoder).values[0])
         for network in (self.policy, self.value):
             _shrink(network)
-        self.actor = ProbabilisticActor(
-            _Logits(self.policy),
-            in_keys={"logits": "logits", "mask": "action_mask"},
-            out_keys=["action"],
-            distribution_class=MaskedCategorical,
-            return_log_prob=True,
-        )
+        self.actor = self.policy.actor()
         env = BeliefEnv(model, problem.start, batch_size=(_EPISODES,), seed=seed)
         self.env = TransformedEnv(env, _SpreadCounter(max_steps=model.horizon))
         self.advantage = GAE(
@@ -214,20 +207,6 @@ class _SpreadCounter(StepCounter):
             spread = torch.arange(len(count), device=count.device) * self.max_steps // len(count)
             result.set("step_count", spread.view_as(count))
         return result
-
-
-class _Logits(TensorDictModuleBase):
-    """A policy network without its control: TorchRL draws none where a module has written one."""
-
-    out_keys = ["logits"]
-
-    def __init__(self, network: PolicyNetwork) -> None:
-        super().__init__()
-        self.network, self.in_keys = network, network.in_keys
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``"logits"``."""
-        return tensordict.set("logits", self.network(tensordict.select(*self.in_keys)).get("logits"))
 
 
 class _Critic(TensorDictModuleBase):
