@@ -49,7 +49,7 @@ PEERS = {
     **a_search(
         planners.DESPOT,
         scenarios=(3, integers(1)),
-        depth=(4, integers(1)),
+        depth=(4, [wrong for wrong in integers(1) if wrong.value is not None]),
         regularisation=(0.0, numbers("[0, inf)")),
         gap=(0.5, numbers("[0, 1)")),
         bound=("trivial", choices()),
@@ -73,7 +73,7 @@ PEERS = {
         problem=a_problem(),
         folder=(folder / "run", paths()),
         checkpoint=(None, objects(3)),
-        ppo_steps=(None, [wrong for wrong in integers(1) if wrong.value is not None]),
+        ppo_steps=(None, [wrong for wrong in integers(4096) if wrong.value is not None]),
         states=(2, integers(2)),
         seconds=(0.0005, numbers("(0, inf)")),
         seed=(0, integers()),

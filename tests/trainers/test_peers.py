@@ -91,11 +91,11 @@ def test_ppo_is_trained_once(line3, tmp_path, monkeypatch):
 
     monkeypatch.setattr(peers, "ppo", fake)
     y = line3.model.unrestricted().with_features(line3.start(torch.arange(20)))
-    logits = [peers._trained_ppo(line3, tmp_path, 100, 3, False)(y.clone())["logits"] for _ in range(2)]
-    assert trained == [(100, 3)]
+    logits = [peers._trained_ppo(line3, tmp_path, 5000, 3, False)(y.clone())["logits"] for _ in range(2)]
+    assert trained == [(5000, 3)]
     assert torch.equal(*logits)
-    peers._trained_ppo(line3, tmp_path, 101, 3, False)
-    assert trained == [(100, 3), (101, 3)]
+    peers._trained_ppo(line3, tmp_path, 5001, 3, False)
+    assert trained == [(5000, 3), (5001, 3)]
 
 
 def test_what_does_not_belong_is_refused(folder, line3, checkpoint, linear20, tmp_path):

@@ -39,7 +39,7 @@ from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.report.peers import Outcome
 from torchrl_pomdp.trainers.architecture import make_networks
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest
-from torchrl_pomdp.trainers.ppo import ppo
+from torchrl_pomdp.trainers.ppo import BATCH, ppo
 from torchrl_pomdp.trainers.recipes import r_t
 
 __all__ = ["compare_peers"]
@@ -50,6 +50,8 @@ _BLOCK = 10
 _TIMED = 15
 # Most trajectories of an online decision; its time ends it.
 _TRAJECTORIES = 4096
+# Most belief steps of PPO, which make a month.
+_MOST_STEPS = 10**10
 # Most scenarios of DESPOT, as its authors have them.
 _SCENARIOS = 500
 
@@ -117,7 +119,7 @@ def compare_peers(
         if problem_digest(checkpoint.problem) != problem_digest(problem):
             raise ValueError(f"checkpoint must be of the problem {problem.name}, got one of {checkpoint.problem.name}")
     if ppo_steps is not None:
-        check_integer("ppo_steps", ppo_steps, 1)
+        check_integer("ppo_steps", ppo_steps, BATCH, _MOST_STEPS)
     # Whatever cannot be made is refused before anything is written.
     peers = _peers(problem, checkpoint, seconds)
     found = {"problem": problem_digest(problem), "seconds": seconds, "seed": seed}
