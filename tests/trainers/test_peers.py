@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -153,3 +154,9 @@ def test_the_command_refuses_nonsense(arguments, message, tmp_path, capsys, monk
     assert cli.main(["compare", "line3", *arguments.split()]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()
+
+
+def test_without_value_networks_nothing_is_cut(line3, checkpoint):
+    bare = PartitionedValue([line3.pessimistic_cost] * line3.partition.num_parts)
+    names = [set(peers._peers(line3, each, 0.01)) for each in (checkpoint, replace(checkpoint, value=bare))]
+    assert names[0] - names[1] == {"R-T of urgency"}

@@ -4,7 +4,7 @@ r"""Every method on one problem, from the same start states and under the same n
 name           what it is
 ============== ==================================================================================================
 greedy, …      the problem's base policies
-R-NT, R-T      online rollout of the last base policy, without and with truncation
+R-NT, R-T      online rollout of the last base policy, without truncation, and with it where there are value networks
 pAPI-NT k, …   the trained policy, and online rollout on top of it
 POMCP, DESPOT  tree searches: ``orig`` with every control that can be carried out and random play, as out of the box;
                ``mod`` with legal controls and random play; ``fair`` with legal controls and a good base policy
@@ -31,7 +31,7 @@ from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationCon
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
-from torchrl_pomdp.modules import Policy, RolloutPolicy
+from torchrl_pomdp.modules import Policy, RolloutPolicy, ValueNetwork
 from torchrl_pomdp.modules.threads import kept_threads
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.planners import DESPOT, POMCP
@@ -142,7 +142,9 @@ def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> d
     peers = {name: _Peer(policy) for name, policy in bases.items()}
     peers[f"R-NT of {base_name}"] = _Peer(RolloutPolicy(model, base, **online))
     if checkpoint is not None:
-        if len(problem.partition.stages) > 1:
+        # Without value networks there is nothing to cut simulations by.
+        earlier = [part for stage in problem.partition.stages[:-1] for part in stage]
+        if earlier and all(isinstance(checkpoint.value.values[part], ValueNetwork) for part in earlier):
             peers[f"R-T of {base_name}"] = _Peer(r_t(problem, base, checkpoint.value, **online))
         peers[checkpoint.name] = _Peer(checkpoint.policy)
         peers[f"{checkpoint.name} + R-NT"] = _Peer(RolloutPolicy(model, checkpoint.policy, **online))
