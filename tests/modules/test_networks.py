@@ -145,9 +145,11 @@ def test_an_actor_draws_legal_controls_by_the_softmax_of_the_logits(linear20):
     y = linear20.model.with_features(linear20.start(torch.arange(5)))
     logits = network(y.clone())["logits"].masked_fill(~y["action_mask"], -torch.inf)
     rows = y.repeat_interleave(4000).reshape(-1)
-    with torch.random.fork_rng(), set_exploration_type(ExplorationType.RANDOM):
+    with torch.random.fork_rng():
         torch.manual_seed(0)
         drawn = network.actor()(rows)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(network.actor()(y.clone())["action"], logits.argmax(-1))
     counts = torch.zeros(5, 3).index_put_(
         (torch.arange(5).repeat_interleave(4000), drawn["action"]), torch.ones(()), accumulate=True
     )

@@ -9,10 +9,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_pomdp.envs import TabularModel
 from torchrl_pomdp.envs.repair import UniformStart, joint_belief, tabular_model
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import Myopic
-from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.modules.repair import UrgencyRepair
 from torchrl_pomdp.planners import DESPOT, POMCP, solve, tree_search
 from torchrl_pomdp.problems import make_problem
 
@@ -214,8 +215,10 @@ def test_models_and_policies_without_a_twin_are_refused(make, line3, linear20):
         make(rocks.model, None)
     with pytest.raises(ValueError, match=r"base_policy must have a scalar twin.*function"):
         make(line3.model, lambda y: y)
-    with pytest.raises(ValueError, match="base_policy must have a scalar twin"):
-        make(line3.model, GreedyRepair(linear20.model))
+    with pytest.raises(ValueError, match="base_policy must have a scalar twin for this very model"):
+        make(line3.model, UrgencyRepair(linear20.model))
+    with pytest.raises(ValueError, match=r"model must have a scalar twin.*RockSample"):
+        make(rocks.model, rocks.base_policies[rocks.baseline])
 
 
 def test_without_numba_it_says_what_to_install(make, line3, monkeypatch):
@@ -235,3 +238,55 @@ def test_equal_bounds_at_the_root_are_answered(line3):
     decided = search(y.clone())
     assert int(decided["action"]) == 0
     assert float(decided["q_factors"][0, 0]) == pytest.approx(100.0)
+
+
+def test_random_play_vouches_for_no_control():
+    # One stage: a control costs what it costs, whatever controls the scenarios have drawn.
+    problem = make_problem("tiger")
+    y = problem.start(torch.arange(1))
+    exact = torch.stack([problem.model.expected_cost(y, torch.tensor([u])) for u in range(3)], -1)
+    for search in (DESPOT(problem.model, simulations=300, max_steps=1), POMCP(problem.model, simulations=300, max_steps=1)):
+        torch.testing.assert_close(search(y.clone())["q_factors"], exact)
+
+
+@pytest.mark.parametrize("depth", [2, 3])
+def test_short_horizons_are_solved_exactly_but_for_the_scenarios(depth):
+    problem = make_problem("tiger")
+    model = problem.model
+
+    def best(y, left):
+        """Cost of the best plan for so many stages, by enumeration."""
+        if left == 0:
+            return torch.zeros(1)
+        return q(y, left).amin(-1)
+
+    def q(y, left):
+        costs = []
+        for u in range(3):
+            control = torch.tensor([u])
+            probs, cost = model.observation_probs(y, control)[0], model.expected_cost(y, control)
+            for z in range(2):
+                cost = cost + model.discount * probs[z] * best(model.estimator(y, control, torch.tensor([z])), left - 1)
+            costs.append(cost)
+        return torch.stack(costs, -1)
+
+    y = problem.start(torch.arange(1)).set("belief", torch.tensor([[0.1, 0.9]]))
+    exact = q(y, depth)
+    found = DESPOT(model, simulations=400, scenarios=4000, max_steps=depth, gap=0.0)(y.clone())["q_factors"]
+    best_control = int(exact.argmin())
+    assert int(found.argmin()) == best_control
+    assert float(found[0, best_control]) == pytest.approx(float(exact.min()), abs=1.5)
+
+
+def test_costs_that_overflow_are_refused(make):
+    half = torch.full((2, 2, 2), 0.5)
+    model = TabularModel(torch.eye(2).expand(2, 2, 2), half, torch.tensor([[1e38, 1e38], [2e38, 2e38]]), 0.9)
+    y = TensorDict({"belief": torch.tensor([[0.5, 0.5]])}, [1])
+    with pytest.raises(ValueError, match=r"q_factors must be finite as torch\.float32"):
+        make(model, None)(y)
+
+
+def test_any_seed_will_do(make, line3):
+    for problem in (line3, make_problem("tiger")):
+        y = problem.start(torch.arange(1))
+        assert make(problem.model, None, seed=2**70, max_steps=20)(y.clone())["q_factors"].shape == (1, 3)

@@ -132,6 +132,7 @@ class PolicyNetwork(LocalNetwork):
             >>> y["action_log_prob"].shape
             torch.Size([5])
         """
+        from tensordict.nn import InteractionType
         from torchrl.modules import MaskedCategorical, ProbabilisticActor
 
         return ProbabilisticActor(
@@ -140,6 +141,7 @@ class PolicyNetwork(LocalNetwork):
             out_keys=["action"],
             distribution_class=MaskedCategorical,
             return_log_prob=True,
+            default_interaction_type=InteractionType.RANDOM,
         )
 
 

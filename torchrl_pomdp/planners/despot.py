@@ -36,7 +36,8 @@ class DESPOT(TreeSearch):
 
     Args:
         model: the belief model; it needs a scalar twin, as repair and tabular models have.
-        base_policy: default policy with a scalar twin; None: any legal control, all equally likely. It reads histories only.
+        base_policy: default policy with a scalar twin; None: any legal control, all equally likely, drawn anew
+            in every scenario and at every stage. It reads histories only.
 
     Keyword Args:
         simulations: explorations of a decision; fewer where the gap is closed; or
@@ -108,7 +109,8 @@ class DESPOT(TreeSearch):
         from torchrl_pomdp.planners.despot_loop import OVER, Options, answer, expand, walk
 
         tight = self.bound == "relaxed"
-        options = Options(self.scenarios, self.depth, self.regularisation, self.gap, self.model.discount, tight)
+        random = self.base_policy is None
+        options = Options(self.scenarios, self.depth, self.regularisation, self.gap, self.model.discount, tight, random)
         state, memory, key = roots.state(number), np.empty(self.scenarios, np.int64), roots.keys[number]
         tree, steps = self._tree(roots.width), 0
 

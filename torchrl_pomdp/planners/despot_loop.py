@@ -39,7 +39,10 @@ _ROUNDING = 1e-9
 
 
 class Options(NamedTuple):
-    """Numbers of a search; see :class:`~torchrl_pomdp.planners.DESPOT`."""
+    """Numbers of a search; see :class:`~torchrl_pomdp.planners.DESPOT`.
+
+    ``tight``: whether the model's relaxation bounds costs; ``random``: whether the base policy draws its controls.
+    """
 
     scenarios: int
     depth: int
@@ -47,6 +50,7 @@ class Options(NamedTuple):
     gap: float
     discount: float
     tight: bool
+    random: bool
 
 
 class Despot(NamedTuple):
@@ -54,7 +58,7 @@ class Despot(NamedTuple):
 
     Attributes:
         size: numbers of nodes and of entries of ``members`` in use, ``[2]``.
-        chosen: control of the base policy at the root, ``[1]``.
+        chosen: control of the base policy at the root, -1 where it is drawn, ``[1]``.
         rows: states of the model, ``[N, W]``.
         seen: variables that its scenarios have seen, ``[N]``.
         parents: ``[N]``.
@@ -174,7 +178,7 @@ def _branch(model, state, tree, node, u, key, options, numbers):
 def _plant(model, policy, state, tree, options):
     """Put the root, with all scenarios, into the tree."""
     start(model, state)
-    tree.chosen[0] = preferred(model, policy, state)
+    tree.chosen[0] = -1 if options.random else preferred(model, policy, state)
     start(model, state)
     keep(model, state, tree.rows[0])
     tree.size[0], tree.size[1], tree.parents[0], tree.depths[0], tree.seen[0] = 1, options.scenarios, -1, 0, np.uint64(0)
@@ -204,7 +208,7 @@ def expand(model, policy, state, tree, numbers, key, node, options, least):
     steps, new = 0, tree.size[0]
     if node < 0:
         _plant(model, policy, state, tree, options)
-        if tree.chosen[0] < 0 and not over(model, state):
+        if tree.chosen[0] < 0 and not options.random and not over(model, state):
             return steps, ILLEGAL
     else:
         weight = _weight(tree, node, options) * tree.counts[node]
@@ -335,5 +339,6 @@ def answer(tree, options, q):
     for u in range(len(q)):
         if tree.legal[0, u]:
             q[u] = tree.costs[0, u] + options.regularisation + _through(tree, 0, u, tree.upper)
-    # The base policy is one way to go on after its own control.
-    q[tree.chosen[0]] = min(q[tree.chosen[0]], tree.base[0])
+    # The base policy is one way to go on after its own control; random play has none.
+    if tree.chosen[0] >= 0:
+        q[tree.chosen[0]] = min(q[tree.chosen[0]], tree.base[0])

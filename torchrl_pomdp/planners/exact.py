@@ -126,6 +126,11 @@ class AlphaVectorPolicy(TensorDictModuleBase):
     def _plan_costs(self, y: TensorDictBase) -> Tensor:
         """Costs ``[*B, N]`` of all plans, at least one of them finite."""
         belief = check_entries("y", y, self.in_keys).get("belief")
+        if belief.shape != (*y.batch_size, self.model.num_states):
+            raise ValueError(
+                f"entry 'belief' of y must have shape {(*y.batch_size, self.model.num_states)}, got {tuple(belief.shape)}; "
+                "for a repair model see joint_belief"
+            )
         # The marks of illegal plans are small whole numbers, which a product of matrices adds without rounding.
         cost = (belief.double() @ self._costs).masked_fill((belief > 0).float() @ self._illegal > 0, torch.inf)
         if bool(cost.isinf().all(-1).any()):

@@ -30,6 +30,9 @@ class POMCP(TreeSearch):
 
     where c is ``exploration`` times the range of the simulations' costs so far; controls that were never taken come first.
 
+    ``"q_factors"`` are means over all simulations, those that explored among them: they fall towards the best policy's cost as
+    the tree grows. With random play for a base policy that takes very long.
+
     Args:
         model: the belief model; it needs a scalar twin, as repair and tabular models have.
         base_policy: rollout policy with a scalar twin; None: any legal control, all equally likely.

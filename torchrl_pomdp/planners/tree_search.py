@@ -128,13 +128,14 @@ class TreeSearch(TensorDictModuleBase):
             engine = local_engine((), self.model, limits)
         else:
             engine = scalar_engine(self.base_policy, self.model, limits)
-        if engine is None:
-            what = type(self.model).__name__ if self.base_policy is None else type(self.base_policy).__name__
-            name = "model" if self.base_policy is None else "base_policy"
-            raise ValueError(
-                f"{name} must have a scalar twin for a search on {self.model.device} of {type(self.model).__name__}, got {what}"
-            )
-        return engine
+        if engine is not None:
+            return engine
+        of_model = type(self.model).__name__
+        if self.base_policy is None or local_engine((), self.model, limits) is None:
+            raise ValueError(f"model must have a scalar twin, as repair and tabular models on a CPU have, got {of_model}")
+        raise ValueError(
+            f"base_policy must have a scalar twin for this very model, a {of_model}, got {type(self.base_policy).__name__}"
+        )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``, and ``"q_factors"``, ``[*B, U]``, infinite where a control was not tried."""
@@ -155,7 +156,12 @@ class TreeSearch(TensorDictModuleBase):
             steps = map_threads(lambda i: self._decide(roots, i, found[i]), numbers, torch.get_num_threads())
             with self._lock:
                 self.simulated_steps += sum(steps)
-        return torch.from_numpy(found).to(self.model.dtype).view(*y.batch_size, found.shape[1])
+        result = torch.from_numpy(found).to(self.model.dtype)
+        if bool(result.isinf().logical_xor(torch.from_numpy(found).isinf()).any()):
+            raise ValueError(
+                f"q_factors must be finite as {self.model.dtype}, got {found[np.isfinite(found)].max()}: scale costs"
+            )
+        return result.view(*y.batch_size, found.shape[1])
 
     @abstractmethod
     def _decide(self, roots: Roots, number: int, found: NDArray[np.float64]) -> int:

@@ -6,7 +6,8 @@ name           what it is
 greedy, …      the problem's base policies
 R-NT, R-T      online rollout of the last base policy, without truncation, and with it where there are value networks
 pAPI-NT k, …   the trained policy, and online rollout on top of it
-POMCP, DESPOT  tree searches: ``orig`` with every control that can be carried out and random play, as out of the box;
+POMCP, DESPOT  tree searches: ``orig`` with every control that can be carried out and random play, as out of the box,
+               where that is more than the legal ones;
                ``mod`` with legal controls and random play; ``fair`` with legal controls and a good base policy
 PPO            masked proximal policy optimisation, with as many belief steps as policy iteration has simulated
 ============== ==================================================================================================
@@ -86,7 +87,8 @@ def compare_peers(
         checkpoint: a trained policy of the problem; None: without one.
         ppo_steps: belief steps that PPO is trained for; None: without PPO.
         states: start states.
-        seconds: time of each decision of the methods that plan online.
+        seconds: time of each decision of the methods that plan online. Rollout makes its first trajectories in any case, which
+            takes some tenths of a second for models without a compiled loop.
         seed: seed of start states and noise, and of PPO.
         report: called with the name of a method and its outcome as soon as it is known.
         progress: whether to show progress bars.
@@ -152,7 +154,8 @@ def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> d
         everything, name = model.unrestricted(), search.__name__
         options: dict[str, Any] = {"scenarios": _scenarios(seconds)} if search is DESPOT else {}
         box: dict[str, Any] = options | ({"bound": "trivial"} if search is DESPOT else {})
-        peers[f"{name} orig"] = _Peer(search(everything, None, seconds=seconds, **box), unrestricted=True)
+        if everything is not model:
+            peers[f"{name} orig"] = _Peer(search(everything, None, seconds=seconds, **box), unrestricted=True)
         peers[f"{name} mod"] = _Peer(search(model, None, seconds=seconds, **box))
         peers[f"{name} fair"] = _Peer(search(model, base, seconds=seconds, **options))
     return peers

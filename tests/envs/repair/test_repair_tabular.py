@@ -148,3 +148,12 @@ def test_problems_that_are_too_large_are_refused():
     for call in (lambda: tabular_model(model), lambda: joint_belief(model, make_problem("linear20").start(torch.arange(1)))):
         with pytest.raises(ValueError, match=r"model must have at most 131072 joint states .*, got 1907348632812500 with"):
             call()
+
+
+def test_what_is_legal_without_restrictions_is_so_in_the_table():
+    model = make_problem("line3").model.unrestricted()
+    belief = torch.eye(5)[torch.tensor([0, 3, 1])].expand(1, 3, 5)
+    y = TensorDict({"belief": belief, "location": torch.zeros(1, 1, dtype=torch.int64)}, [1])
+    table = tabular_model(model)
+    mask = table.action_mask(TensorDict({"belief": joint_belief(model, y)}, [1]))
+    assert mask.tolist() == model.action_mask(y).tolist() == [[True, False, True]]

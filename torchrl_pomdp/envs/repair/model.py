@@ -198,6 +198,10 @@ class RepairModel(Robots):
             mask = (mask.unsqueeze(-1) & robots[..., robot, :].unsqueeze(-2)).flatten(-2)
         return mask
 
+    def legal_when_intact(self) -> Tensor:
+        """Controls that a robot may take where its location is known to be intact, bool ``[L, A]``."""
+        return self._legal_when_intact.clone()
+
     def unrestricted(self) -> RepairModel:
         """The same model where intact locations may be repaired, as the paper's peers took it (Section VI-D).
 

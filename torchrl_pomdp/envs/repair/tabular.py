@@ -149,7 +149,7 @@ def _number(digit: Tensor, base: int) -> Tensor:
 def _legal(model: RepairModel, controls: Tensor, places: Tensor, levels: Tensor, looked: Tensor) -> Tensor:
     """Legal controls ``[n, U]``: every robot's control is legal for it."""
     moves = model.destinations.cpu()[places] >= 0
-    moves[..., REPAIR] = ~moves[..., REPAIR + 1 :].any(-1)
+    moves[..., REPAIR] = model.legal_when_intact().cpu()[places][..., REPAIR]
     damaged = levels[:, places.T].permute(0, 2, 1) > 0
     # [flags, blocks, levels, robots]: whether the robot may repair.
     repair = moves[..., REPAIR].unsqueeze(1) | damaged.permute(1, 0, 2) | ~looked[:, None, None]

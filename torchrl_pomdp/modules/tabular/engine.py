@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from tensordict import TensorDictBase
 
 from torchrl_pomdp.envs.belief_model import BeliefModel
@@ -69,7 +68,7 @@ class TabularEngine(SearchEngine):
         """See :class:`SearchEngine`."""
         model = self.model
         beliefs = np.ascontiguousarray(y.get("belief").reshape(-1, model.num_states).double().numpy())
-        keys = fold(model.fingerprint(y).reshape(-1), torch.tensor(seed))
+        keys = fold(model.fingerprint(y).reshape(-1), seed)
 
         def state(number: int) -> TabularHistory:
             return TabularHistory(

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
-from tensordict import TensorDict
 
-from torchrl_pomdp.envs.repair.model import RepairModel
+from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
 from torchrl_pomdp.modules.repair.base_policies import first_moves
 from torchrl_pomdp.modules.repair.scalar.view import Tables
@@ -42,7 +40,7 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
         distances=distances.astype(np.int64),
         first_controls=model.graph.first_controls.numpy(),
         first_moves=first_moves(model).numpy(),
-        unrestricted=_may_repair_intact(model),
+        unrestricted=bool(model.legal_when_intact()[:, REPAIR].all()),
         columns=np.zeros(size) if own is None else own.columns.double().numpy(),
         prices=np.array(costs if own is None else own.prices, np.float64),
         absorbing=absorbing,
@@ -55,12 +53,3 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
         low=0.0 if own is None else own.density_bounds[0],
         high=0.0 if own is None else own.density_bounds[1],
     )
-
-
-def _may_repair_intact(model: RepairModel) -> bool:
-    """Whether robots may repair where nothing is damaged, wherever they are."""
-    size = model.num_locations
-    belief = torch.eye(model.num_levels, dtype=model.dtype)[0].expand(size, size, -1)
-    location = torch.arange(size).unsqueeze(-1).expand(size, model.num_robots)
-    # Joint control 0: all repair.
-    return bool(model.action_mask(TensorDict({"belief": belief, "location": location}, [size]))[:, 0].all())
