@@ -90,7 +90,7 @@ class Compare:
 
     checkpoint: Path | None = None
     """A trained policy of the problem; with it come online rollout on top of it, and PPO with as many belief steps as are
-    written in the folder of its run."""
+    written in the folder of its run, which may take hours."""
 
     states: int = 100
     """Start states."""

@@ -160,3 +160,11 @@ def test_without_value_networks_nothing_is_cut(line3, checkpoint):
     bare = PartitionedValue([line3.pessimistic_cost] * line3.partition.num_parts)
     names = [set(peers._peers(line3, each, 0.01)) for each in (checkpoint, replace(checkpoint, value=bare))]
     assert names[0] - names[1] == {"R-T of urgency"}
+
+
+def test_ppo_comes_last(line3, tmp_path, monkeypatch):
+    order = []
+    monkeypatch.setattr(peers, "_peers", lambda problem, *_: {"greedy": peers._Peer(GreedyRepair(problem.model))})
+    monkeypatch.setattr(peers, "_trained_ppo", lambda problem, *_: order.append("trained") or GreedyRepair(problem.model))
+    compare_peers(line3, tmp_path, ppo_steps=5000, states=2, seconds=0.001, report=lambda name, _: order.append(name))
+    assert order == ["greedy", "trained", "PPO"]

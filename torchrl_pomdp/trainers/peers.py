@@ -126,13 +126,15 @@ def compare_peers(
     peers = _peers(problem, checkpoint, seconds)
     found = {"problem": problem_digest(problem), "seconds": seconds, "seed": seed}
     path = open_run_folder(check_path("folder", folder), found)
-    if ppo_steps is not None:
-        peers["PPO"] = _Peer(_trained_ppo(problem, path, ppo_steps, seed, progress))
     execution = _Execution(problem, path, states, seed, progress)
     outcomes: dict[str, Outcome] = {}
     for name, peer in peers.items():
         outcomes[name] = execution.outcome(name, peer)
         report(name, outcomes[name])
+    if ppo_steps is not None:
+        # Last, since its training takes longest.
+        outcomes["PPO"] = execution.outcome("PPO", _Peer(_trained_ppo(problem, path, ppo_steps, seed, progress)))
+        report("PPO", outcomes["PPO"])
     return outcomes
 
 
