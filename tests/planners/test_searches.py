@@ -15,6 +15,7 @@ from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import Myopic
 from torchrl_pomdp.modules.repair import UrgencyRepair
 from torchrl_pomdp.planners import DESPOT, POMCP, solve, tree_search
+from torchrl_pomdp.planners import despot as despot_module
 from torchrl_pomdp.problems import make_problem
 
 SEARCHES = {
@@ -290,3 +291,20 @@ def test_any_seed_will_do(make, line3):
     for problem in (line3, make_problem("tiger")):
         y = problem.start(torch.arange(1))
         assert make(problem.model, None, seed=2**70, max_steps=20)(y.clone())["q_factors"].shape == (1, 3)
+
+
+def test_a_long_exploration_ends_with_the_time(linear20, monkeypatch):
+    search = DESPOT(linear20.model, None, seconds=1.0, scenarios=10, bound="trivial")
+    y = linear20.start(torch.arange(1))
+    search(y.clone())
+    # As if the time were over after the first node: it has children, and their bounds have come up to the root.
+    clock = iter([0.0, *[2.0] * 100])
+    monkeypatch.setattr(despot_module, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(search.budget, "stretches", lambda: iter([1]))
+    before = search.simulated_steps
+    decided = search(y.clone())
+    little = search.simulated_steps - before
+    assert torch.equal(torch.isfinite(decided["q_factors"]), linear20.model.action_mask(y))
+    monkeypatch.setattr(despot_module, "perf_counter", lambda: 0.0)
+    search(y.clone())
+    assert search.simulated_steps - before - little > 3 * little

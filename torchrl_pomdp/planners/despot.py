@@ -2,7 +2,9 @@ r"""DESPOT: determinized sparse partially observable trees (Somani, Ye, Hsu & Le
 
 from __future__ import annotations
 
+import math
 from itertools import chain
+from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
@@ -113,6 +115,7 @@ class DESPOT(TreeSearch):
         options = Options(self.scenarios, self.depth, self.regularisation, self.gap, self.model.discount, tight, random)
         state, memory, key = roots.state(number), np.empty(self.scenarios, np.int64), roots.keys[number]
         tree, steps = self._tree(roots.width), 0
+        until = perf_counter() + (self.budget.seconds or math.inf)
 
         def grow(node: int) -> int:
             made, how = self.call(expand, roots.model, roots.policy, state, tree, memory, key, node, options, roots.least)
@@ -129,6 +132,10 @@ class DESPOT(TreeSearch):
                     return made
                 tree = self._with_room(tree, node)
                 made += grow(node)
+                # An exploration may go down hundreds of nodes.
+                if perf_counter() > until:
+                    self._check_bounds(self.call(walk, tree, node, options)[1])
+                    return made
 
         steps += grow(OVER)
         for _ in chain.from_iterable(map(range, self.budget.stretches())):
