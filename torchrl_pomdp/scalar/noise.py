@@ -13,10 +13,12 @@ from torchrl_pomdp.modules.scenarios import BITS, LARGEST, STEPS
 from torchrl_pomdp.noise import FACTOR, GOLDEN, ROUNDS, STEP
 from torchrl_pomdp.scalar.compiling import inner
 
-__all__ = ["Noise", "fold", "hash_numbers", "scenario_noise", "uniform", "variable_bit"]
+__all__ = ["CONTROLS", "Noise", "fold", "hash_numbers", "scenario_noise", "uniform", "variable_bit"]
 
 _GOLDEN, _FIRST, _SECOND = np.uint64(GOLDEN), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _FACTOR, _STEP, _STEPS = np.uint64(FACTOR), np.uint64(STEP), np.uint64(STEPS)
+CONTROLS = np.uint64(0x636F6E74)
+"""Folded into a key, it sets the numbers of random controls apart from those of observations."""
 _ONE, _ROUNDS, _BITS = np.uint64(1), ROUNDS, BITS
 _UNIT, _LARGEST = np.float32(2.0**-24), np.float32(LARGEST)
 

@@ -9,13 +9,10 @@ from numpy.typing import NDArray
 
 from torchrl_pomdp.scalar.compiling import inner
 from torchrl_pomdp.scalar.models import ScalarModel
-from torchrl_pomdp.scalar.noise import Noise, fold, scenario_noise, uniform, variable_bit
+from torchrl_pomdp.scalar.noise import CONTROLS, Noise, fold, scenario_noise, uniform, variable_bit
 from torchrl_pomdp.scalar.twins import choose, scalar_twin
 
 __all__ = ["TabularHistory", "TabularTables", "TabularView", "myopic", "random", "tabular_model"]
-
-# Sets the numbers of random controls apart from those of observations.
-_CONTROLS = np.uint64(0x636F6E74)
 
 
 class TabularTables(NamedTuple):
@@ -269,7 +266,7 @@ tabular_model = ScalarModel(
 @scalar_twin
 def random(data, view, controls):
     """Any legal control, all equally likely."""
-    number, count = uniform(fold(view.key, _CONTROLS), np.uint64(view.stage)), 0
+    number, count = uniform(fold(view.key, CONTROLS), np.uint64(view.stage)), 0
     for flag in view.legal:
         count += flag
     left = np.int64(number * np.float32(count))

@@ -6,19 +6,16 @@ import numpy as np
 
 from torchrl_pomdp.modules.repair.scalar.view import expected_cost, intact, legal, part_of, probability, split
 from torchrl_pomdp.scalar.compiling import inner, products
-from torchrl_pomdp.scalar.noise import fold, uniform
+from torchrl_pomdp.scalar.noise import CONTROLS, fold, uniform
 from torchrl_pomdp.scalar.twins import choose, scalar_twin
 
 __all__ = ["greedy", "networks", "random", "urgency"]
-
-# Sets the numbers of random controls apart from those of observations.
-_CONTROLS = np.uint64(0x636F6E74)
 
 
 @scalar_twin
 def random(data, view, controls):
     """Each robot takes any of its legal controls, all equally likely."""
-    key = fold(view.key, _CONTROLS)
+    key = fold(view.key, CONTROLS)
     for robot in range(len(controls)):
         number, count = uniform(key, np.uint64(view.stage * len(controls) + robot)), 0
         for control in range(view.tables.destinations.shape[1]):
