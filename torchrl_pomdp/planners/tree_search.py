@@ -158,8 +158,9 @@ class TreeSearch(TensorDictModuleBase):
                 self.simulated_steps += sum(steps)
         result = torch.from_numpy(found).to(self.model.dtype)
         if bool(result.isinf().logical_xor(torch.from_numpy(found).isinf()).any()):
+            largest = np.abs(found[np.isfinite(found)]).max()
             raise ValueError(
-                f"q_factors must be finite as {self.model.dtype}, got {found[np.isfinite(found)].max()}: scale costs"
+                f"q_factors must be finite as {self.model.dtype}, got {largest:g}: costs, or the regularisation, are too large"
             )
         return result.view(*y.batch_size, found.shape[1])
 
