@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite
 
+from torchrl_pomdp.envs.digits import joined
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.world import World
 from torchrl_pomdp.problems.maintenance_model import INSPECT, REPLACE, MaintenanceModel
@@ -75,14 +76,7 @@ class MaintenanceWorld(World):
         table = model.likelihood.view(model.num_levels, 2, model.num_components, model.num_levels)
         seen = inverse_cdf(table[level, (controls == INSPECT).to(torch.int64), component], show)
         hidden_after = self._hidden(level, (time + 1).clamp_max(model.num_stages))
-        return cost.masked_fill(self.is_terminal(hidden), 0.0), hidden_after, self._joint(seen)
-
-    def _joint(self, seen: Tensor) -> Tensor:
-        """The observation of what the components show, ``[*B, n]``, the first most significant."""
-        z = seen[..., 0]
-        for component in range(1, self.model.num_components):
-            z = z * self.model.num_levels + seen[..., component]
-        return z
+        return cost.masked_fill(self.is_terminal(hidden), 0.0), hidden_after, joined(seen, model.num_levels)
 
     def _hidden(self, level: Tensor, time: Tensor) -> TensorDict:
         return TensorDict({"level": level, "time": time}, batch_size=time.shape, device=self.model.device)

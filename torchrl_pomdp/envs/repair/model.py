@@ -21,11 +21,12 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
+from torchrl_pomdp.envs.digits import digits
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.repair.chains import checked_chain, checked_costs, drifts, off_diagonals, overflowing_levels
 from torchrl_pomdp.envs.repair.graphs import Graph
 from torchrl_pomdp.envs.repair.partition import RepairPartition, location_costs
-from torchrl_pomdp.envs.repair.robots import Robots, digits
+from torchrl_pomdp.envs.repair.robots import Robots
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.sums import multiply_first, sum_first
 from torchrl_pomdp.envs.world import World

@@ -13,10 +13,11 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_integer, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.digits import digits, joined
 from torchrl_pomdp.envs.names import number_of
 from torchrl_pomdp.envs.repair.graphs import Graph
 
-__all__ = ["Robots", "digits"]
+__all__ = ["Robots"]
 
 
 class Robots(BeliefModel):
@@ -44,10 +45,7 @@ class Robots(BeliefModel):
 
     def join_controls(self, controls: Tensor) -> Tensor:
         """Joint controls ``[*B]`` of robots' controls ``[*B, R]``."""
-        joint = controls[..., 0]
-        for robot in range(1, self.num_robots):
-            joint = joint * self.num_robot_controls + controls[..., robot]
-        return joint
+        return joined(controls, self.num_robot_controls)
 
     # ---- what real robots do and report --------------------------------------------------------------------------------
 
@@ -153,16 +151,3 @@ class Robots(BeliefModel):
     @abstractmethod
     def _successor(self, y: TensorDictBase, planes: Tensor, location: Tensor) -> TensorDictBase:
         """The feature state of planes ``[L, K, N]`` and locations ``[R, N]``."""
-
-
-def digits(number: Tensor, base: int, count: int) -> Tensor:
-    """Base-``base`` digits ``[*B, count]`` of ``number`` ``[*B]``, most significant first.
-
-    Examples:
-        >>> digits(torch.tensor(7), 3, 2).tolist()
-        [2, 1]
-    """
-    if count == 1:
-        return number.unsqueeze(-1)
-    powers = base ** torch.arange(count - 1, -1, -1, device=number.device)
-    return number.unsqueeze(-1) // powers % base

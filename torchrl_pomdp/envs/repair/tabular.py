@@ -22,8 +22,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_flag, check_instance
+from torchrl_pomdp.envs.digits import digits, joined
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
-from torchrl_pomdp.envs.repair.robots import digits
 from torchrl_pomdp.envs.tabular import TabularModel
 
 __all__ = ["joint_belief", "tabular_model"]
@@ -111,8 +111,8 @@ def joint_belief(model: RepairModel, y: TensorDictBase, *, start_observed: bool 
     joint = belief[..., 0, :]
     for place in range(1, model.num_locations):
         joint = (joint.unsqueeze(-1) * belief[..., place, None, :]).flatten(-2)
-    block = _number(location, model.num_locations)
-    block = block + (0 if start_observed else _number(unknown.long(), 2)) * model.num_locations**model.num_robots
+    block = joined(location, model.num_locations)
+    block = block + (0 if start_observed else joined(unknown.long(), 2)) * model.num_locations**model.num_robots
     result = joint.new_zeros(*y.batch_size, flags * model.num_locations**model.num_robots, joint.shape[-1])
     index = block[..., None, None].expand(*y.batch_size, 1, joint.shape[-1])
     return result.scatter_(-2, index, joint.unsqueeze(-2)).flatten(-2)
@@ -138,14 +138,6 @@ def _levels(model: RepairModel) -> Tensor:
     return digits(torch.arange(model.num_levels**model.num_locations), model.num_levels, model.num_locations)
 
 
-def _number(digit: Tensor, base: int) -> Tensor:
-    """The number ``[*B]`` with digits ``[*B, count]``; inverse of :func:`digits`."""
-    number = digit[..., 0]
-    for k in range(1, digit.shape[-1]):
-        number = number * base + digit[..., k]
-    return number
-
-
 def _legal(model: RepairModel, controls: Tensor, places: Tensor, levels: Tensor, looked: Tensor) -> Tensor:
     """Legal controls ``[n, U]``: every robot's control is legal for it."""
     moves = model.destinations.cpu()[places] >= 0
@@ -167,7 +159,7 @@ def _transition(model: RepairModel, controls: Tensor, places: Tensor, flags: int
     index, values = [], []
     for u, control in enumerate(controls):
         goal = destinations[places, control.expand_as(places)]
-        goal = _number(torch.where(goal < 0, places, goal), model.num_locations) * block
+        goal = joined(torch.where(goal < 0, places, goal), model.num_locations) * block
         for origin, (place, target) in enumerate(zip(places, goal.tolist(), strict=True)):
             repaired = tuple(sorted(set(place[control == REPAIR].tolist())))
             if repaired not in known:
@@ -199,7 +191,7 @@ def _levels_step(chain: Tensor, num_locations: int, repaired: tuple[int, ...]) -
 
 def _observation(model: RepairModel, places: Tensor, levels: Tensor, flags: int) -> Tensor:
     """Observation table ``[U, n, Z]``, sparse: the levels where the robots stand, surely."""
-    seen = _number(levels[:, places.T].movedim(1, -1), model.num_levels).T.flatten().repeat(flags)
+    seen = joined(levels[:, places.T].movedim(1, -1), model.num_levels).T.flatten().repeat(flags)
     n, controls = len(seen), model.num_controls
     index = torch.stack(
         [

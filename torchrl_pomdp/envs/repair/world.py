@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite
 
+from torchrl_pomdp.envs.digits import joined
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.sums import sum_first
@@ -77,14 +78,7 @@ class RepairWorld(World):
         repairs = torch.zeros_like(level).scatter_add(-1, location, (controls == REPAIR).to(torch.int64))
         level = inverse_cdf(model.chain[level], noise).masked_fill(repairs > 0, 0)
         location = model.destinations[location, controls]
-        return cost, self._hidden(level, location), self._joint(level.gather(-1, location))
-
-    def _joint(self, seen: Tensor) -> Tensor:
-        """The joint observation of levels ``[*B, R]``, whose base-K digits they are."""
-        z = seen[..., 0]
-        for robot in range(1, self.model.num_robots):
-            z = z * self.model.num_levels + seen[..., robot]
-        return z
+        return cost, self._hidden(level, location), joined(level.gather(-1, location), model.num_levels)
 
     def _hidden(self, level: Tensor, location: Tensor) -> TensorDict:
         return TensorDict({"level": level, "location": location}, batch_size=level.shape[:-1], device=self.model.device)
