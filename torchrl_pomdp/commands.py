@@ -119,8 +119,8 @@ def _named_policy(command: Evaluate, device: torch.device) -> tuple[Problem, Pol
 
 def compare(command: Compare) -> None:
     """Compare all methods; print the table, write it with its numbers, then draw its pictures."""
-    given = None if command.checkpoint is None else load_checkpoint(command.checkpoint, problem=_own(command.problem))
     problem = find_problem(command.problem, torch.device("cpu"))
+    given = None if command.checkpoint is None else load_checkpoint(command.checkpoint, problem=problem)
     name = f"compare-{problem.name}-{command.seconds:g}s"
     runs, out = check_folder("runs", command.runs), check_folder("out", command.out)
     outcomes = compare_peers(
@@ -144,11 +144,6 @@ def compare(command: Compare) -> None:
     title = f"{problem.name}, {command.states} start states"
     pictures = {out / f"{name}-time.png": partial(peer_figure, outcomes, title)}
     print(draw(pictures | {out / f"{name}.png": partial(cost_figure, results, f"{title}\nbelow: against {problem.baseline}")}))
-
-
-def _own(name: str) -> Problem | None:
-    """The problem that a checkpoint does not know by itself: one of one's own code."""
-    return find_problem(name, torch.device("cpu")) if ":" in name else None
 
 
 def _simulated_steps(folder: Path) -> int | None:

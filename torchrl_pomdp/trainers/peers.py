@@ -152,13 +152,14 @@ def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> d
             peers[f"R-T of {base_name}"] = _Peer(r_t(problem, base, checkpoint.value, **online))
         peers[checkpoint.name] = _Peer(checkpoint.policy)
         peers[f"{checkpoint.name} + R-NT"] = _Peer(RolloutPolicy(model, checkpoint.policy, **online))
+    everything = model.unrestricted()
     for search in (POMCP, DESPOT):
-        everything, name = model.unrestricted(), search.__name__
+        name = search.__name__
         options: dict[str, Any] = {"scenarios": _scenarios(seconds)} if search is DESPOT else {}
-        box: dict[str, Any] = options | ({"bound": "trivial"} if search is DESPOT else {})
+        as_they_come: dict[str, Any] = {**options, "bound": "trivial"} if search is DESPOT else {}
         if everything is not model:
-            peers[f"{name} orig"] = _Peer(search(everything, None, seconds=seconds, **box), unrestricted=True)
-        peers[f"{name} mod"] = _Peer(search(model, None, seconds=seconds, **box))
+            peers[f"{name} orig"] = _Peer(search(everything, None, seconds=seconds, **as_they_come), unrestricted=True)
+        peers[f"{name} mod"] = _Peer(search(model, None, seconds=seconds, **as_they_come))
         peers[f"{name} fair"] = _Peer(search(model, base, seconds=seconds, **options))
     return peers
 
@@ -204,24 +205,22 @@ class _Execution:
 
     def outcome(self, name: str, peer: _Peer) -> Outcome:
         """A method's costs, from the folder as far as they are there."""
-        policy = peer.policy
-        blocks = list(self._blocks(name, peer))
+        owner = digest([problem_digest(self.problem), name, peer.policy, self.seed])
+        blocks = list(self._blocks(name, peer, owner))
         costs = torch.cat([block["costs"] for block in blocks])
         if self._baseline is None:
             self._baseline = costs
         decisions, steps = (sum(block[key] for block in blocks) for key in ("decisions", "steps"))
-        return Outcome(compare(costs, self._baseline), self._time(name, policy), steps / max(decisions, 1))
+        return Outcome(compare(costs, self._baseline), self._time(name, peer.policy, owner), steps / max(decisions, 1))
 
-    def _blocks(self, name: str, peer: _Peer) -> Iterator[dict[str, Any]]:
-        policy = peer.policy
+    def _blocks(self, name: str, peer: _Peer, owner: str) -> Iterator[dict[str, Any]]:
         model = self.problem.model.unrestricted() if peer.unrestricted else self.problem.model
-        owner = digest([problem_digest(self.problem), name, policy, self.seed])
         for first in range(0, self.states, _BLOCK):
             count = min(_BLOCK, self.states - first)
             path = self.folder / name / f"{first:07d}-{count}.pt"
             block = kept(path, f"{owner} {first}")
             if block is None:
-                block = self._evaluate(f"{name}, from state {first}", model, policy, first, count)
+                block = self._evaluate(f"{name}, from state {first}", model, peer.policy, first, count)
                 keep(path, f"{owner} {first}", block)
             yield block
 
@@ -243,9 +242,9 @@ class _Execution:
         steps = (_simulated_steps(policy) or 0) - before
         return {"costs": costs.cpu(), "decisions": counted.decisions if isinstance(counted, _Counted) else 0, "steps": steps}
 
-    def _time(self, name: str, policy: Policy) -> float:
+    def _time(self, name: str, policy: Policy, owner: str) -> float:
         """Median time of a decision in the first start states, taken once."""
-        path, owner = self.folder / name / "time.pt", digest([problem_digest(self.problem), name, policy, self.seed])
+        path = self.folder / name / "time.pt"
         content = kept(path, owner)
         if content is None:
             model = self.problem.model

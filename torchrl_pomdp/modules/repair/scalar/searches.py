@@ -21,7 +21,7 @@ from torchrl_pomdp.modules.repair.scalar.events import (
     terminal,
 )
 from torchrl_pomdp.modules.repair.scalar.trajectories import FINE, NEVER, Work, begin, continued, set_initial
-from torchrl_pomdp.modules.repair.scalar.view import View, expected_cost, legal, split
+from torchrl_pomdp.modules.repair.scalar.view import View, expected_cost, jointly_legal, legal, split
 from torchrl_pomdp.scalar.compiling import inner
 from torchrl_pomdp.scalar.models import ScalarModel
 from torchrl_pomdp.scalar.noise import scenario_noise, variable_bit
@@ -95,14 +95,9 @@ def _refresh(tables, state):
 
 
 def _mask(data, state, legal_controls):
-    tables, _ = data
-    view, controls = _view(tables, state, np.uint64(0)), state.work.controls
+    view, controls = _view(data[0], state, np.uint64(0)), state.work.controls
     for u in range(len(legal_controls)):
-        split(u, tables.destinations.shape[1], controls)
-        fits = True
-        for robot in range(len(controls)):
-            fits = fits and legal(view, robot, controls[robot])
-        legal_controls[u] = fits
+        legal_controls[u] = jointly_legal(view, u, controls)
 
 
 def _costs(data, state, out):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_pomdp.modules.repair.scalar.view import expected_cost, intact, legal, part_of, probability, split
+from torchrl_pomdp.modules.repair.scalar.view import expected_cost, intact, jointly_legal, legal, part_of, probability, split
 from torchrl_pomdp.scalar.compiling import inner, products
 from torchrl_pomdp.scalar.noise import CONTROLS, fold, uniform
 from torchrl_pomdp.scalar.twins import choose, scalar_twin
@@ -135,11 +135,7 @@ def _best_control(view, work, at, width, controls):
     """The legal joint control with the largest logit, ties to the lower."""
     base, best, highest = view.tables.destinations.shape[1], -1, -np.inf
     for u in range(width):
-        split(u, base, controls)
-        fits = True
-        for robot in range(len(controls)):
-            fits = fits and legal(view, robot, controls[robot])
-        if fits and work[at + u] > highest:
+        if jointly_legal(view, u, controls) and work[at + u] > highest:
             best, highest = u, work[at + u]
     if best < 0 or highest == np.inf:
         # Logits that have overflowed choose nothing.

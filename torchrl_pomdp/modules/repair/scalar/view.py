@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchrl_pomdp.scalar.compiling import inner, shared
 
-__all__ = ["Tables", "View", "expected_cost", "intact", "legal", "legal_at", "part_of", "probability", "split"]
+__all__ = ["Tables", "View", "expected_cost", "intact", "jointly_legal", "legal", "legal_at", "part_of", "probability", "split"]
 
 
 class Tables(NamedTuple):
@@ -141,6 +141,16 @@ def legal(view, robot, control):
     """Whether a robot may take a control."""
     place = view.location[robot]
     return legal_at(view.tables, place, view.intact[place] == 1.0, control)
+
+
+@inner
+def jointly_legal(view, u, controls):
+    """Whether the robots may take joint control ``u``, which is put into ``controls`` ``[R]``."""
+    split(u, view.tables.destinations.shape[1], controls)
+    fits = True
+    for robot in range(len(controls)):
+        fits = fits and legal(view, robot, controls[robot])
+    return fits
 
 
 @inner
