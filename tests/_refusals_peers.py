@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from _hostile import choices, flags, integers, mappings, numbers, objects, paths, policies, values
+from _hostile import choices, flags, integers, mappings, numbers, objects, paths, policies, sequences, values
 from _valid import a_problem, belief_model, callback, case, state
 
 from torchrl_pomdp import planners, report, trainers
@@ -18,7 +18,7 @@ TITLES = values(None, 3, b"x", [], object())
 
 def outcome():
     cost = torch.tensor([10.0, 20.0])
-    return report.Outcome(compare(cost, cost), 0.1, 10.0)
+    return report.Outcome(compare(cost, cost), 0.1, 10.0, (10.0, 20.0))
 
 
 def search(kind, **options):
@@ -59,6 +59,7 @@ PEERS = {
         comparison=(outcome().comparison, objects(3)),
         seconds=(0.1, numbers("(0, inf)")),
         steps=(3.0, numbers("[0, inf)")),
+        costs=((1.0, 2.0), [*sequences((1.0, 2.0), None, "x", 3, float("nan"))]),
     ),
     "report.peer_table": lambda _: case(
         report.peer_table, outcomes=({"a": outcome()}, [*mappings(), *values({"a": 3}, {"a": None})])
@@ -74,6 +75,7 @@ PEERS = {
         folder=(folder / "run", paths()),
         checkpoint=(None, objects(3)),
         ppo_steps=(None, [wrong for wrong in integers(4096) if wrong.value is not None]),
+        methods=(["urgency"], [wrong for wrong in sequences(["urgency"], None, 3, "x", b"x") if wrong.value is not None]),
         states=(2, integers(2)),
         seconds=(0.0005, numbers("(0, inf)")),
         seed=(0, integers()),

@@ -92,6 +92,9 @@ class Compare:
     """A trained policy of the problem; with it come online rollout on top of it, and PPO with as many belief steps as are
     written in the folder of its run, which may take hours."""
 
+    methods: tuple[str, ...] | None = None
+    """Names of the methods to compare with the baseline, as the table has them; all if left out."""
+
     states: int = 100
     """Start states."""
 

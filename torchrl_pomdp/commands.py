@@ -128,6 +128,7 @@ def compare(command: Compare) -> None:
         runs / name,
         checkpoint=given,
         ppo_steps=None if command.checkpoint is None else _simulated_steps(command.checkpoint.parent),
+        methods=command.methods,
         states=command.states,
         seconds=command.seconds,
         seed=command.seed,

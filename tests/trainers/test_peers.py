@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from torchrl_pomdp import cli
+from torchrl_pomdp.evaluation import compare
 from torchrl_pomdp.modules import PartitionedValue
 from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import make_problem
@@ -160,6 +161,24 @@ def test_without_value_networks_nothing_is_cut(line3, checkpoint):
     bare = PartitionedValue([line3.pessimistic_cost] * line3.partition.num_parts)
     names = [set(peers._peers(line3, each, 0.01)) for each in (checkpoint, replace(checkpoint, value=bare))]
     assert names[0] - names[1] == {"R-T of urgency"}
+
+
+def test_some_methods_of_all(folder, line3, checkpoint, monkeypatch):
+    """They come in the order of all, beside the baseline, and from what has been kept."""
+    path, outcomes = folder
+    monkeypatch.setattr(peers, "discounted_costs", None)
+    some = compare_peers(line3, path, checkpoint=checkpoint, methods=["POMCP fair", "pAPI-NT 1"], states=3, seconds=0.001)
+    assert some == {name: outcomes[name] for name in ("greedy", "pAPI-NT 1", "POMCP fair")}
+    assert list(some) == ["greedy", "pAPI-NT 1", "POMCP fair"]
+    with pytest.raises(ValueError, match=r"methods must be one of greedy, urgency, R-NT of urgency, .* got 'PPO'"):
+        compare_peers(line3, path, methods=["PPO"], states=3, seconds=0.001)
+
+
+def test_costs_of_two_comparisons_are_paired(folder):
+    """Each method's costs are those of the same start states, so that two tables can be put beside each other."""
+    _, outcomes = folder
+    costs, baseline = (torch.tensor(outcomes[name].costs) for name in ("POMCP fair", "greedy"))
+    assert compare(costs, baseline) == outcomes["POMCP fair"].comparison
 
 
 def test_ppo_comes_last(line3, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from torchrl_pomdp.checks import check_instance, check_mapping, check_number, check_text
+from torchrl_pomdp.checks import check_instance, check_mapping, check_number, check_sequence, check_text
 from torchrl_pomdp.evaluation import Comparison
 from torchrl_pomdp.pictures import new_figure
 from torchrl_pomdp.report.tables import half_width, interval_text, ratio_texts
@@ -25,6 +25,7 @@ class Outcome:
         comparison: its costs beside the baseline's.
         seconds: median time of a decision, of a single state on a single core.
         steps: belief steps that a decision simulates, on average.
+        costs: its cost from each start state; those of two comparisons with the same seed are paired.
 
     Raises:
         TypeError: if something is of the wrong kind.
@@ -34,11 +35,14 @@ class Outcome:
     comparison: Comparison
     seconds: float
     steps: float
+    costs: tuple[float, ...]
 
     def __post_init__(self) -> None:
         check_instance("comparison", self.comparison, Comparison)
         check_number("seconds", self.seconds, "(0, inf)")
         check_number("steps", self.steps, "[0, inf)")
+        for cost in check_sequence("costs", self.costs, float, least=1):
+            check_number("costs", cost)
 
     def to_dict(self) -> dict[str, Any]:
         """All numbers, for JSON."""
@@ -55,7 +59,7 @@ def peer_table(outcomes: Mapping[str, Outcome]) -> str:
         >>> import torch
         >>> from torchrl_pomdp.evaluation import compare
         >>> cost = torch.tensor([10.0, 20.0])
-        >>> print(peer_table({"greedy": Outcome(compare(cost, cost), 0.0004, 0.0)}))
+        >>> print(peer_table({"greedy": Outcome(compare(cost, cost), 0.0004, 0.0, (10.0, 20.0))}))
         | method | discounted cost | ratio | 95 % interval of the ratio | ms a decision | simulated steps a decision |
         |---|---|---|---|---|---|
         | greedy | 15.0 ± 9.8 | 1.000 | 1.000 … 1.000 | 0.4 | 0 |

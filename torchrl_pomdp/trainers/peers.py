@@ -15,7 +15,7 @@ PPO            masked proximal policy optimisation, with as many belief steps as
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -27,7 +27,16 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_number, check_path
+from torchrl_pomdp.checks import (
+    check_callable,
+    check_choice,
+    check_flag,
+    check_instance,
+    check_integer,
+    check_number,
+    check_path,
+    check_sequence,
+)
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.identity import digest
@@ -71,6 +80,7 @@ def compare_peers(
     *,
     checkpoint: Checkpoint | None = None,
     ppo_steps: int | None = None,
+    methods: Sequence[str] | None = None,
     states: int = 100,
     seconds: float = 0.1,
     seed: int = EVALUATION_SEED,
@@ -86,6 +96,7 @@ def compare_peers(
     Keyword Args:
         checkpoint: a trained policy of the problem; None: without one.
         ppo_steps: belief steps that PPO is trained for; None: without PPO.
+        methods: names of the methods to compare with the baseline; None: all.
         states: start states.
         seconds: time of each decision of the methods that plan online. Rollout makes its first trajectories in any case, which
             takes some tenths of a second for models without a compiled loop.
@@ -99,8 +110,8 @@ def compare_peers(
     Raises:
         ImportError: if numba, which the extra ``fast`` installs, is missing.
         TypeError: if an argument is of the wrong kind.
-        ValueError: if a number is out of range, the folder holds something else, the checkpoint is of another problem, or
-            the model or the last base policy has no scalar twin.
+        ValueError: if a number is out of range, a method is not there, the folder holds something else, the checkpoint is of
+            another problem, or the model or the last base policy has no scalar twin.
 
     Examples:
         >>> import tempfile
@@ -123,19 +134,27 @@ def compare_peers(
     if ppo_steps is not None:
         check_integer("ppo_steps", ppo_steps, BATCH, _MOST_STEPS)
     # Whatever cannot be made is refused before anything is written.
-    peers = _peers(problem, checkpoint, seconds)
+    peers: dict[str, _Peer | None] = {**_peers(problem, checkpoint, seconds)}
+    if ppo_steps is not None:
+        # Last, since its training takes longest.
+        peers["PPO"] = None
+    names = [problem.baseline, *(peers if methods is None else _chosen(methods, peers))]
     found = {"problem": problem_digest(problem), "seconds": seconds, "seed": seed}
     path = open_run_folder(check_path("folder", folder), found)
     execution = _Execution(problem, path, states, seed, progress)
     outcomes: dict[str, Outcome] = {}
-    for name, peer in peers.items():
+    for name in dict.fromkeys(names):
+        peer = peers[name] or _Peer(_trained_ppo(problem, path, ppo_steps or 0, seed, progress))
         outcomes[name] = execution.outcome(name, peer)
         report(name, outcomes[name])
-    if ppo_steps is not None:
-        # Last, since its training takes longest.
-        outcomes["PPO"] = execution.outcome("PPO", _Peer(_trained_ppo(problem, path, ppo_steps, seed, progress)))
-        report("PPO", outcomes["PPO"])
     return outcomes
+
+
+def _chosen(methods: Sequence[str], peers: Iterable[str]) -> list[str]:
+    """The methods asked for, in the order of all."""
+    for name in check_sequence("methods", methods, str, least=1):
+        check_choice("methods", name, peers)
+    return [name for name in peers if name in methods]
 
 
 def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> dict[str, _Peer]:
@@ -211,7 +230,8 @@ class _Execution:
         if self._baseline is None:
             self._baseline = costs
         decisions, steps = (sum(block[key] for block in blocks) for key in ("decisions", "steps"))
-        return Outcome(compare(costs, self._baseline), self._time(name, peer.policy, owner), steps / max(decisions, 1))
+        taken = self._time(name, peer.policy, owner)
+        return Outcome(compare(costs, self._baseline), taken, steps / max(decisions, 1), tuple(costs.tolist()))
 
     def _blocks(self, name: str, peer: _Peer, owner: str) -> Iterator[dict[str, Any]]:
         model = self.problem.model.unrestricted() if peer.unrestricted else self.problem.model
