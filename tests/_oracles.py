@@ -22,6 +22,17 @@ def small_model(graph=None, num_robots=1, degradation=(0.0, 0.3), costs=(0.0, 1.
     return RepairModel(graph, damage_chain(degradation), costs, 0.9, num_robots=num_robots, dtype=dtype, **kw)
 
 
+def varied_model(graph=None, num_robots=1, seed=0, repair_probability=0.6, dtype=torch.float64, **kw):
+    """A model whose locations have chains and costs of their own, with drift, and whose repairs may fail."""
+    graph = line(3) if graph is None else graph
+    generator = torch.Generator().manual_seed(seed)
+    chain = torch.rand(graph.num_locations, 3, 3, generator=generator, dtype=torch.float64)
+    chain = chain * (torch.rand(chain.shape, generator=generator, dtype=torch.float64) < 0.7) + torch.eye(3) * 0.1
+    costs = torch.rand(graph.num_locations, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.5, 2.0, 9.0])
+    options = {"num_robots": num_robots, "repair_probability": repair_probability, "dtype": dtype}
+    return RepairModel(graph, chain / chain.sum(-1, keepdim=True), costs, 0.9, **options, **kw)
+
+
 def random_states(model: RepairModel, count: int, seed: int) -> TensorDict:
     """Random beliefs, some of them certain, robots having observed or not."""
     generator = torch.Generator().manual_seed(seed)
@@ -93,10 +104,12 @@ def brute_force(model: RepairModel, belief: torch.Tensor, location: list[int], c
 
     Written from the problem's statement alone: enumerates every joint state and its successors.
     """
-    states, chain = joint_states(model), model.chain
+    states = joint_states(model)
+    chain, costs = model.chain.expand(model.num_locations, -1, -1), model.costs.expand(model.num_locations, -1)
+    works = model.repair_probability
     size, levels, robots = model.num_locations, model.num_levels, model.num_robots
     prior = torch.stack([belief[i, states[:, i]] for i in range(size)]).prod(0)
-    cost = float((prior * model.costs[states].sum(-1)).sum())
+    cost = float((prior * sum(costs[i, states[:, i]] for i in range(size))).sum())
     table = model.graph.neighbours.tolist()
     after = [place if c == 0 else table[place][c - 1] for place, c in zip(location, controls, strict=True)]
     repaired = {place for place, c in zip(location, controls, strict=True) if c == 0}
@@ -104,10 +117,11 @@ def brute_force(model: RepairModel, belief: torch.Tensor, location: list[int], c
     for state, p in zip(states.tolist(), prior.tolist(), strict=True):
         if p == 0:
             continue
-        options = [
-            [(0, 1.0)] if i in repaired else [(k, float(chain[level, k])) for k in range(levels) if chain[level, k] > 0]
-            for i, level in enumerate(state)
-        ]
+        options = []
+        for i, level in enumerate(state):
+            grown = [(k, float(chain[i, level, k])) for k in range(levels) if chain[i, level, k] > 0]
+            failed = [(k, (1.0 - works) * q) for k, q in grown] if works < 1.0 else []
+            options.append([(0, works), *failed] if i in repaired else grown)
         for outcome in product(*options):
             weight, nxt = p, []
             for level, q in outcome:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from _oracles import COSTS, brute_force, random_states, small_model
+from _oracles import COSTS, brute_force, random_states, small_model, varied_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
@@ -23,8 +23,10 @@ TRIANGLE = Graph.from_edges("triangle with a tail", 4, [(0, 1), (1, 2), (2, 0), 
 )
 @settings(max_examples=60, deadline=None)
 def test_cost_observations_and_estimator_equal_brute_force_bayes(seed, case):
-    graph, num_robots, degradation = case
-    model = small_model(graph, num_robots, degradation)
+    _equals_brute_force(small_model(*case), seed)
+
+
+def _equals_brute_force(model, seed):
     y = model.with_features(random_states(model, 1, seed))
     legal = y["action_mask"][0].nonzero().flatten()
     u = legal[seed % len(legal)].reshape(1)
@@ -40,6 +42,40 @@ def test_cost_observations_and_estimator_equal_brute_force_bayes(seed, case):
             # The exact posterior of a product prior is a product, so its marginals are the whole belief.
             torch.testing.assert_close(nxt["belief"][0], posterior[z], atol=1e-12, rtol=0)
             assert nxt["location"][0].tolist() == after
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    case=st.sampled_from([(line(3), 1), (line(3), 2), (TRIANGLE, 1), (line(2), 2), (line(2), 3), (grid(2, 2), 2)]),
+    works=st.sampled_from([0.3, 0.8, 1.0]),
+)
+@settings(max_examples=80, deadline=None)
+def test_locations_of_many_kinds_and_repairs_that_fail_equal_brute_force_bayes(seed, case, works):
+    _equals_brute_force(varied_model(*case, seed=seed, repair_probability=works), seed)
+
+
+def test_robots_at_one_location_make_one_attempt():
+    """By hand: two robots repair together; it works with probability 0.6, whoever else tries."""
+    model = small_model(line(2), 2, (0.0, 0.25), repair_probability=0.6)
+    certain = torch.eye(3, dtype=torch.float64)
+    y = TensorDict({"belief": certain[[1, 0]].unsqueeze(0), "location": torch.tensor([[0, 0]])}, [1])
+    u = torch.tensor([0])
+    probs = model.observation_probs(y, u)[0]
+    assert {z: round(p, 12) for z, p in enumerate(probs.tolist()) if p > 0} == {0: 0.6, 4: 0.3, 8: 0.1}
+    assert model.estimator(y, u, torch.tensor([4]))["belief"].tolist() == [[[0, 1, 0], [1, 0, 0]]]
+    nobody = model.follow(y[0], u[0], None)["belief"][0]
+    torch.testing.assert_close(nobody, torch.tensor([0.6, 0.3, 0.1], dtype=torch.float64))
+
+
+def test_equal_locations_are_one_kind():
+    """Tables that say the same of every location make the same model, to the last bit."""
+    one = small_model(line(3))
+    chain, costs = one.chain.expand(3, -1, -1), one.costs.expand(3, -1)
+    other = RepairModel(line(3), chain, costs, 0.9, dtype=torch.float64)
+    assert other.chain.shape == (3, 3)
+    assert other.costs.shape == (3,)
+    y = random_states(one, 20, 0)
+    assert torch.equal(one.expected_cost(y), other.expected_cost(y))
 
 
 @pytest.mark.parametrize("num_robots", [1, 2])

@@ -124,14 +124,16 @@ class RandomState:
         self.range = max(1, round(low * model.num_locations)), max(1, round(high * model.num_locations))
         # A library's products of matrices may differ by device and threads; on a CPU one thread does so few numbers.
         chain = model.chain.cpu()
-        self._powers = torch.stack([torch.linalg.matrix_power(chain, age) for age in range(max_age + 1)]).to(model.device)
+        powers = torch.stack([torch.linalg.matrix_power(chain, age) for age in range(max_age + 1)]).to(model.device)
+        # [ages, L or 1, K, K].
+        self._powers = powers if chain.ndim == 3 else powers.unsqueeze(1)
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
         (low, high), keys = self.range, check_keys("keys", keys)
         count = low + (_uniforms(keys, _FRACTION, 1).squeeze(-1) * (high - low + 1)).to(torch.int64)
         age = (_uniforms(keys, _AGE, 1).squeeze(-1) * (self.max_age + 1)).to(torch.int64)
-        fresh, powers = _random_beliefs(self.model, keys, count), self._powers[age].unsqueeze(-3)
+        fresh, powers = _random_beliefs(self.model, keys, count), self._powers[age]
         # Level by level, as a library's product of matrices would round by the number of states.
         belief = fresh[..., :1] * powers[..., 0, :]
         for level in range(1, self.model.num_levels):

@@ -1,7 +1,7 @@
 r"""The sequential repair problem with its exact factored belief (paper, Section VI-A), for any graph and any robots.
 
 One stage, in this order: (1) the cost of all locations, on the state before the control; (2) every robot repairs its own
-location or moves to a neighbour; (3) every location that is not just repaired takes one step of the damage chain;
+location or moves to a neighbour; (3) every location that is not just repaired takes one step of its damage chain;
 (4) every robot observes exactly the level of the location where it now stands.
 
 Locations stay independent given the history, so the belief is a product of marginals, ``belief[..., l, k]`` = P(level of
@@ -23,9 +23,17 @@ from torchrl.data import Bounded, Categorical, Composite
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.digits import digits
 from torchrl_pomdp.envs.partition import Partition
-from torchrl_pomdp.envs.repair.chains import checked_chain, checked_costs, drifts, off_diagonals, overflowing_levels
+from torchrl_pomdp.envs.repair.chains import (
+    checked_chain,
+    checked_costs,
+    drifts,
+    location_costs,
+    off_diagonals,
+    overflowing_levels,
+    prices,
+)
 from torchrl_pomdp.envs.repair.graphs import Graph
-from torchrl_pomdp.envs.repair.partition import RepairPartition, location_costs
+from torchrl_pomdp.envs.repair.partition import RepairPartition
 from torchrl_pomdp.envs.repair.robots import Robots
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.sums import multiply_first, sum_first
@@ -50,14 +58,19 @@ class RepairModel(Robots):
     A robot may not leave the graph; it may repair a location known to be at level 0 only where no move is possible. States
     with P(any damage) <= ``terminal_probability`` are terminal if level 0 is absorbing.
 
+    A repair may fail: with probability :math:`1-\rho` the location takes a step of its chain as if nobody had been there. The
+    robot sees the level and with it whether the repair has worked. Robots that repair one location together make one attempt.
+
     Args:
         graph: where the robots move.
-        chain: row-stochastic matrix ``[K, K]`` of the damage levels, see :func:`damage_chain`.
-        costs: cost of a location per stage at each level, ``[K]``, finite and nonnegative.
+        chain: row-stochastic matrix ``[K, K]`` of the damage levels, see :func:`damage_chain`; or ``[L, K, K]``, one for each
+            location.
+        costs: cost of a location per stage at each level, ``[K]`` or ``[L, K]``, finite and nonnegative.
         discount: :math:`\alpha`.
 
     Keyword Args:
         num_robots: R, at least 1; at most 65536 joint controls.
+        repair_probability: :math:`\rho`, that a repair works, in (0, 1].
         terminal_probability: :math:`\epsilon`, in [0, 1).
         partition: partition whose index becomes a feature.
         dtype: float32 or float64.
@@ -90,6 +103,7 @@ class RepairModel(Robots):
         discount: float,
         *,
         num_robots: int = 1,
+        repair_probability: float = 1.0,
         terminal_probability: float = 1e-6,
         partition: Partition | None = None,
         dtype: torch.dtype = torch.float32,
@@ -98,9 +112,10 @@ class RepairModel(Robots):
         super().__init__(discount)
         self.graph = check_instance("graph", graph, Graph)
         dtype, device = check_dtype("dtype", dtype), check_device("device", device)
-        chain = checked_chain(chain)
-        self.num_locations, self.num_levels = graph.num_locations, chain.shape[0]
-        costs = checked_costs(costs, self.num_levels, dtype)
+        chain = checked_chain(chain, graph.num_locations)
+        self.num_locations, self.num_levels = graph.num_locations, chain.shape[-1]
+        costs = checked_costs(costs, self.num_locations, self.num_levels, dtype)
+        self.repair_probability = check_number("repair_probability", repair_probability, "(0, 1]")
         self.num_robots = check_integer("num_robots", num_robots, 1, 16)
         self.num_robot_controls = len(graph.control_names)
         self.num_controls = self.num_robot_controls**self.num_robots
@@ -111,7 +126,7 @@ class RepairModel(Robots):
             )
         self.noise_dim = self.num_robots
         self.terminal_probability = check_number("terminal_probability", terminal_probability, "[0, 1)")
-        self.level_zero_absorbing = bool(chain[0, 0] == 1)
+        self.level_zero_absorbing = bool((chain[..., 0, 0] == 1).all())
         self._normalise = drifts(chain, dtype)
         self._register_tables(chain.to(dtype), costs, device)
         if partition is not None:
@@ -134,8 +149,8 @@ class RepairModel(Robots):
         }
         for name, value in tables.items():
             self.register_buffer(name, value.to(device), persistent=False)
-        self._prices = tuple(costs.tolist())
-        self._stay = self.chain.diagonal().view(-1, 1)
+        self._prices = prices(self.costs)
+        self._stay = self.chain.diagonal(dim1=-2, dim2=-1).unsqueeze(-1).contiguous()
         self._diagonals = list(off_diagonals(self.chain))
         self._overflowing = overflowing_levels(chain)
 
@@ -309,12 +324,18 @@ class RepairModel(Robots):
 
     def _columns(self, planes: Tensor, location: Tensor, repaired: Tensor) -> list[Tensor]:
         """For each robot the marginal ``[K, N]`` of its new location at the next stage, before it observes."""
-        intact = torch.eq(self._levels, 0).to(self.dtype)
         columns = []
         for robot, place in enumerate(location):
-            column = self._degrade_planes(self._levels_at(planes, place).unsqueeze(0)).squeeze(0)
-            columns.append(torch.where(self._fixed(robot, location, repaired), intact, column))
+            column = self._degrade(self._levels_at(planes, place).unsqueeze(0), place).squeeze(0)
+            columns.append(torch.where(self._fixed(robot, location, repaired), self._repaired(column), column))
         return columns
+
+    def _repaired(self, column: Tensor) -> Tensor:
+        """Marginal ``[K, N]`` after an attempt to repair, of one that is ``column`` where it fails."""
+        intact = torch.eq(self._levels, 0).to(self.dtype)
+        if self.repair_probability == 1.0:
+            return intact
+        return self.repair_probability * intact + (1.0 - self.repair_probability) * column
 
     def _possible(self, planes: Tensor, location: Tensor, repaired: Tensor, levels: Tensor) -> Tensor:
         """Whether the robots can see ``levels`` ``[R, N]``, bool ``[N]``, given the degraded ``planes``."""
@@ -322,7 +343,9 @@ class RepairModel(Robots):
         for robot, (place, level) in enumerate(zip(location, levels, strict=True)):
             cell = (place * self.num_levels + level).unsqueeze(0)
             seen = planes.flatten(0, 1).gather(0, cell).squeeze(0) > 0
-            possible &= torch.where(self._fixed(robot, location, repaired), level == 0, seen)
+            intact = level == 0
+            after = intact if self.repair_probability == 1.0 else intact | seen
+            possible &= torch.where(self._fixed(robot, location, repaired), after, seen)
             for other in range(robot):
                 # Robots that stand together see the same level.
                 possible &= (place != location[other]) | (level == levels[other])
@@ -348,10 +371,24 @@ class RepairModel(Robots):
         return torch.stack(levels)
 
     def _degrade_planes(self, planes: Tensor) -> Tensor:
-        """One step of the chain in every location: a pass over the planes for each nonzero diagonal."""
-        result = planes * self._stay
+        """One step of the chain in every location."""
+        return self._degrade(planes)
+
+    def _degrade(self, planes: Tensor, place: Tensor | None = None) -> Tensor:
+        """One step of the chains: a pass over the planes ``[L, K, N]`` for each nonzero diagonal.
+
+        Args:
+            planes: beliefs.
+            place: the location of each row ``[N]``, where ``planes`` ``[1, K, N]`` are of these.
+        """
+        several = place is not None and self._stay.ndim == 3
+
+        def own(table: Tensor) -> Tensor:
+            return table[place].permute(2, 1, 0) if several else table
+
+        result = planes * own(self._stay)
         for source, target, probs in self._diagonals:
-            result[:, target].addcmul_(planes[:, source], probs)
+            result[:, target].addcmul_(planes[:, source], own(probs))
         for level in self._overflowing:
             result[:, level].clamp_(max=1.0)
         if self._normalise:

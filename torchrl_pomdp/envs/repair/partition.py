@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_number
 from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.envs.repair.chains import location_costs, prices
 from torchrl_pomdp.envs.repair.graphs import Graph
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.tensor_checks import check_device, check_entries, check_tensor
 
-__all__ = ["RepairPartition", "location_costs"]
+__all__ = ["RepairPartition"]
 
 # How many different columns a plan can have from its left to its right edge.
 _COLUMN_UNITS = 2.0**18
@@ -32,7 +31,7 @@ class RepairPartition(Partition):
 
     Args:
         graph: where the robots are; its columns define left and right.
-        costs: cost of each damage level, ``[K]``.
+        costs: cost of each damage level, ``[K]``; or ``[L, K]``, different by location.
         damage_threshold: probability of damage above which a location is believed damaged.
         device: where the tables are.
 
@@ -65,10 +64,17 @@ class RepairPartition(Partition):
         super().__init__()
         check_instance("graph", graph, Graph)
         self.damage_threshold = check_number("damage_threshold", damage_threshold, "[0, 1)")
-        costs = check_tensor("costs", costs, (None,), finite=False)
-        if len(costs) < 2 or not bool((torch.isfinite(costs.float()) & (costs >= 0)).all()):
+        costs = check_tensor("costs", costs, finite=False)
+        shapes = costs.ndim == 1 or (costs.ndim == 2 and len(costs) == graph.num_locations)
+        if not shapes or costs.shape[-1] < 2:
+            raise ValueError(
+                f"costs must be for at least 2 levels, of all locations or of each of {graph.num_locations}, "
+                f"got shape {tuple(costs.shape)}"
+            )
+        if not bool((torch.isfinite(costs.float()) & (costs >= 0)).all()):
             raise ValueError(f"costs must be finite and nonnegative for at least 2 levels, got {costs.tolist()}")
-        self.prices = tuple(costs.tolist())
+        self.num_levels = costs.shape[-1]
+        self.prices = prices(costs.float().to(check_device("device", device)) if costs.ndim == 2 else costs)
         # In units below which two columns count as equal: coordinates are rounded.
         columns = graph.columns.double() - graph.columns.double().min()
         columns = columns / (float(columns.max()) or 1.0) * _COLUMN_UNITS
@@ -76,7 +82,7 @@ class RepairPartition(Partition):
 
     def check_fits(self, num_locations: int, num_levels: int, device: torch.device) -> None:
         """Raise unless this is a partition for so many locations and levels, on the same device."""
-        own = len(self.columns), len(self.prices)
+        own = len(self.columns), self.num_levels
         if own != (num_locations, num_levels):
             raise ValueError(
                 f"partition must be for {num_locations} locations and {num_levels} levels as the model is, "
@@ -109,14 +115,3 @@ class RepairPartition(Partition):
         total = left + right
         # Cross-multiplied, so that no damage on either side (total = 0) is balanced.
         return 1 - (left > high * total).to(torch.int64) + (left < low * total).to(torch.int64)
-
-
-def location_costs(planes: Tensor, costs: Sequence[float]) -> Tensor:
-    """Expected cost of every location, ``[L, *B]``, for beliefs as planes ``[L, K, *B]`` and a cost for each level."""
-    paid = [level for level, cost in enumerate(costs) if cost != 0]
-    if not paid:
-        return torch.zeros_like(planes[:, 0])
-    total = planes[:, paid[0]] * costs[paid[0]]
-    for level in paid[1:]:
-        total.add_(planes[:, level], alpha=costs[level])
-    return total

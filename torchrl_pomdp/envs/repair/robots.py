@@ -76,12 +76,12 @@ class Robots(BeliefModel):
         """
         levels = self._levels_of(observation)
         location = y.get("location").reshape(-1, 1)
-        return self._successor(y, self._report(self._planes(y).clone(), location, levels, {}), location)
+        return self._successor(y, self._report(self._planes(y).clone(), location, levels), location)
 
     def follow(self, y: TensorDictBase, u: Tensor, observation: Any) -> TensorDictBase:
         """The next state for a single state, of batch ``()``, given the levels that some of the robots report.
 
-        Where no robot reports from, the belief is the prediction; a location that is repaired is known to be intact.
+        Where no robot reports from, the belief is the prediction: intact for sure after a repair that always works.
 
         Raises:
             TypeError: if an observation is no level.
@@ -89,9 +89,10 @@ class Robots(BeliefModel):
         """
         levels = self._levels_of(observation)
         location, repaired = self._move(y, u)
-        fixed = {place: 0 for place, done in zip(location[:, 0].tolist(), repaired[:, 0].tolist(), strict=True) if done}
         planes = self._degrade_planes(self._planes(y))
-        return self._successor(y, self._report(planes, location, levels, fixed), location)
+        for place in {place for place, done in zip(location[:, 0].tolist(), repaired[:, 0].tolist(), strict=True) if done}:
+            planes[place] = self._repaired(planes[place])
+        return self._successor(y, self._report(planes, location, levels), location)
 
     def _each(self, what: str, given: Any) -> Sequence[Any]:
         """What is given for each robot; for one robot it may stand alone."""
@@ -113,10 +114,8 @@ class Robots(BeliefModel):
             for robot, level in enumerate(each)
         ]
 
-    def _report(self, planes: Tensor, location: Tensor, levels: Sequence[int | None], fixed: dict[int, int]) -> Tensor:
-        """The planes ``[L, K, 1]`` of a state once levels are known, written into: those in ``fixed``, then what robots see."""
-        for place, level in fixed.items():
-            planes[place, :, 0] = self._certain(planes, level)
+    def _report(self, planes: Tensor, location: Tensor, levels: Sequence[int | None]) -> Tensor:
+        """The planes ``[L, K, 1]`` of a state once the robots have seen levels, written into."""
         for robot, (place, seen) in enumerate(zip(location[:, 0].tolist(), levels, strict=True)):
             if seen is None:
                 continue
@@ -128,11 +127,8 @@ class Robots(BeliefModel):
                     f"what is known allows levels {possible}"
                 )
             # Robots that stand together see the same level: the next one is held to this.
-            planes[place, :, 0] = self._certain(planes, seen)
+            planes[place, :, 0] = (torch.arange(self.num_levels, device=planes.device) == seen).to(planes.dtype)
         return planes
-
-    def _certain(self, planes: Tensor, level: int) -> Tensor:
-        return (torch.arange(self.num_levels, device=planes.device) == level).to(planes.dtype)
 
     # ---- what the model computes ---------------------------------------------------------------------------------------
 
@@ -147,6 +143,10 @@ class Robots(BeliefModel):
     @abstractmethod
     def _degrade_planes(self, planes: Tensor) -> Tensor:
         """Planes one step of the chain later, as a new tensor."""
+
+    @abstractmethod
+    def _repaired(self, column: Tensor) -> Tensor:
+        """Marginal ``[K, N]`` after an attempt to repair, of one that is ``column`` where it fails."""
 
     @abstractmethod
     def _successor(self, y: TensorDictBase, planes: Tensor, location: Tensor) -> TensorDictBase:

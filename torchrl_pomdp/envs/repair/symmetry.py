@@ -66,8 +66,8 @@ class Symmetry:
 def symmetries(model: RepairModel) -> list[Symmetry]:
     """Symmetries of a repair model that its graph's columns and rows show, the identity first.
 
-    These are all reflections and rotations of the plan by right angles that keep the graph, with all exchanges of the robots;
-    of more than five robots the last five are exchanged.
+    These are all reflections and rotations of the plan by right angles that keep the graph, and the chains and costs of its
+    locations, with all exchanges of the robots; of more than five robots the last five are exchanged.
 
     Args:
         model: the repair model.
@@ -83,6 +83,8 @@ def symmetries(model: RepairModel) -> list[Symmetry]:
     check_instance("model", model, RepairModel)
     found = []
     for locations, slots in _graph_symmetries(model.graph):
+        if not _keeps(locations, model):
+            continue
         controls = torch.tensor([0, *(1 + slot for slot in slots)])
         for order in islice(permutations(range(model.num_robots)), _MOST_ORDERS):
             robots = torch.tensor(order, device=model.device)
@@ -90,6 +92,12 @@ def symmetries(model: RepairModel) -> list[Symmetry]:
             joint = model.join_controls(controls.to(model.device)[every[:, robots]])
             found.append(Symmetry(model, torch.tensor(locations, device=model.device), joint, robots))
     return found
+
+
+def _keeps(locations: list[int], model: RepairModel) -> bool:
+    """Whether every location has the chain and the costs of its image."""
+    tables = (model.chain.expand(model.num_locations, -1, -1), model.costs.expand(model.num_locations, -1))
+    return all(torch.equal(table, table[locations]) for table in tables)
 
 
 def _graph_symmetries(graph: Graph) -> Iterator[tuple[list[int], list[int]]]:

@@ -17,6 +17,8 @@ The repair model calls a state terminal up to a small probability of damage; the
 
 from __future__ import annotations
 
+import math
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -60,7 +62,8 @@ def tabular_model(model: RepairModel, *, start_observed: bool = True) -> Tabular
     places, levels = _places(model), _levels(model)
     controls = digits(torch.arange(model.num_controls), model.num_robot_controls, model.num_robots)
     looked = digits(torch.arange(flags), 2, model.num_robots) == 0
-    cost = model.costs.cpu()[levels].sum(-1).repeat(flags * len(places)).expand(model.num_controls, -1)
+    paid = model.costs.cpu().expand(model.num_locations, -1)[torch.arange(model.num_locations), levels]
+    cost = paid.sum(-1).repeat(flags * len(places)).expand(model.num_controls, -1)
     return TabularModel(
         _transition(model, controls, places, flags),
         _observation(model, places, levels, flags),
@@ -121,7 +124,8 @@ def joint_belief(model: RepairModel, y: TensorDictBase, *, start_observed: bool 
 def _check_size(model: RepairModel, flags: int) -> None:
     places = flags * model.num_locations**model.num_robots
     states = places * model.num_levels**model.num_locations
-    entries = model.num_controls * places * int((model.chain > 0).sum()) ** model.num_locations
+    steps = (model.chain > 0).sum((-2, -1)).expand(model.num_locations).tolist()
+    entries = model.num_controls * places * math.prod(steps)
     if states > _MOST_STATES or entries > _MOST_ENTRIES:
         raise ValueError(
             f"model must have at most {_MOST_STATES} joint states with {_MOST_ENTRIES} transitions, got {states} with {entries}"
@@ -153,7 +157,7 @@ def _legal(model: RepairModel, controls: Tensor, places: Tensor, levels: Tensor,
 
 def _transition(model: RepairModel, controls: Tensor, places: Tensor, flags: int) -> Tensor:
     """Transition table ``[U, n, n]``, sparse; from any flags to none. A robot that would leave the graph stays."""
-    chain, block = model.chain.cpu().double(), model.num_levels**model.num_locations
+    block = model.num_levels**model.num_locations
     destinations = model.destinations.cpu()
     known: dict[tuple[int, ...], tuple[Tensor, Tensor, Tensor]] = {}
     index, values = [], []
@@ -163,7 +167,7 @@ def _transition(model: RepairModel, controls: Tensor, places: Tensor, flags: int
         for origin, (place, target) in enumerate(zip(places, goal.tolist(), strict=True)):
             repaired = tuple(sorted(set(place[control == REPAIR].tolist())))
             if repaired not in known:
-                known[repaired] = _levels_step(chain, model.num_locations, repaired)
+                known[repaired] = _levels_step(model, repaired)
             i, j, p = known[repaired]
             for flag in range(flags):
                 first = (flag * len(places) + origin) * block
@@ -174,14 +178,15 @@ def _transition(model: RepairModel, controls: Tensor, places: Tensor, flags: int
     return torch.sparse_coo_tensor(torch.cat(index, 1), torch.cat(values), shape, check_invariants=False)
 
 
-def _levels_step(chain: Tensor, num_locations: int, repaired: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """From, to and probability of every step of all levels; locations ``repaired`` come to level 0."""
-    fix = torch.zeros_like(chain)
-    fix[:, 0] = 1.0
+def _levels_step(model: RepairModel, repaired: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """From, to and probability of every step of all levels; locations ``repaired`` come to level 0 if the repair works."""
+    chains = model.chain.cpu().double().expand(model.num_locations, -1, -1)
+    fix = torch.zeros_like(chains[0])
+    fix[:, 0] = model.repair_probability
     i = j = torch.zeros(1, dtype=torch.int64)
     p = torch.ones(1, dtype=torch.float64)
-    for place in range(num_locations):
-        table = fix if place in repaired else chain
+    for place, chain in enumerate(chains):
+        table = fix + (1.0 - model.repair_probability) * chain if place in repaired else chain
         source, target = table.nonzero(as_tuple=True)
         i = (i.unsqueeze(1) * len(chain) + source).flatten()
         j = (j.unsqueeze(1) * len(chain) + target).flatten()

@@ -71,14 +71,22 @@ class RepairWorld(World):
         return self._hidden(inverse_cdf(y.get("belief"), noise), y.get("location"))
 
     def advance(self, hidden: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase, Tensor]:
-        """Costs, controls, the chain where nothing is repaired, observations, in this order; see :meth:`World.advance`."""
+        """Costs, controls, repairs and the chains, observations, in this order; see :meth:`World.advance`."""
         level, location, model = hidden.get("level"), hidden.get("location"), self.model
-        cost = sum_first(model.costs[level].movedim(-1, 0).clone())
+        cost = sum_first(self._of_level(model.costs, level).movedim(-1, 0).clone())
         controls = model.split_controls(u)
         repairs = torch.zeros_like(level).scatter_add(-1, location, (controls == REPAIR).to(torch.int64))
-        level = inverse_cdf(model.chain[level], noise).masked_fill(repairs > 0, 0)
+        law = self._of_level(model.chain, level)
+        works = model.repair_probability * torch.eye(model.num_levels, dtype=law.dtype, device=law.device)[0]
+        after = works + (1.0 - model.repair_probability) * law
+        level = inverse_cdf(torch.where((repairs > 0).unsqueeze(-1), after, law), noise)
         location = model.destinations[location, controls]
         return cost, self._hidden(level, location), joined(level.gather(-1, location), model.num_levels)
+
+    def _of_level(self, table: Tensor, level: Tensor) -> Tensor:
+        """Entries of costs or chain for levels ``[*B, L]``."""
+        own = table.ndim - (table is self.model.chain) == 2
+        return table[torch.arange(self.model.num_locations, device=level.device), level] if own else table[level]
 
     def _hidden(self, level: Tensor, location: Tensor) -> TensorDict:
         return TensorDict({"level": level, "location": location}, batch_size=level.shape[:-1], device=self.model.device)

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.repair.chains import location_costs, prices
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
-from torchrl_pomdp.envs.repair.partition import location_costs
 from torchrl_pomdp.modules.scalar import Limited, ScalarEngine
 from torchrl_pomdp.tensor_checks import check_entries
 
@@ -117,7 +117,7 @@ class UrgencyRepair(TensorDictModuleBase):
         self.model = check_instance("model", model, RepairModel)
         self.exponent = check_number("exponent", exponent, "[0, inf)")
         # What a level costs more than an intact location.
-        self._prices = tuple((model.costs - model.costs[0]).tolist())
+        self._prices = prices(model.costs - model.costs[..., :1])
         # [L, L], target by origin.
         nearness = (model.graph.distances.T + 1.0) ** -self.exponent
         self.register_buffer("nearness", nearness.to(model.device, model.dtype), persistent=False)
@@ -129,7 +129,8 @@ class UrgencyRepair(TensorDictModuleBase):
         """Compiled simulations, see :class:`~torchrl_pomdp.modules.scalar.ScalarEngine`."""
         from torchrl_pomdp.modules.repair.scalar import engine, twins
 
-        data = self.nearness.double().numpy().T.copy(), float(self.model.costs[0]), max(self._prices)
+        costs = self.model.costs.double()
+        data = self.nearness.double().numpy().T.copy(), float(costs[..., 0].max()), float((costs - costs[..., :1]).max())
         return engine.repair_engine(twins.urgency, data, self.model, model, limits, numbers=self.model.num_robots)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -7,8 +7,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, shown
+from torchrl_pomdp.envs.repair.chains import location_costs, prices
 from torchrl_pomdp.envs.repair.model import RepairModel
-from torchrl_pomdp.envs.repair.partition import location_costs
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import check_finite
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
@@ -63,16 +63,16 @@ class NeverRepairCost(ClosedFormCost):
         chain = check_instance("model", model, RepairModel).chain.double()
         system = torch.eye(model.num_levels, dtype=chain.dtype, device=chain.device) - model.discount * chain
         # Discounted cost of one location that starts at each level.
-        level_costs = torch.linalg.solve(system, model.costs.double()).to(model.dtype)
+        level_costs = torch.linalg.solve(system, model.costs.double().unsqueeze(-1)).squeeze(-1).to(model.dtype)
         check_finite(f"costs of the model for ever must be finite in {model.dtype}", level_costs)
-        self.level_costs = tuple(level_costs.tolist())
+        self.num_levels, self.level_costs = model.num_levels, prices(level_costs)
 
     def costs(self, y: TensorDictBase) -> Tensor:
         """Costs ``[*B]``."""
         # Planes [L, K, *B] are summed in the same order whatever the batch.
         belief = _belief(y)
-        if belief.shape[y.ndim + 1 :] != (len(self.level_costs),):
-            raise ValueError(f"entry 'belief' of y must end in {len(self.level_costs)} levels, got {tuple(belief.shape)}")
+        if belief.shape[y.ndim + 1 :] != (self.num_levels,):
+            raise ValueError(f"entry 'belief' of y must end in {self.num_levels} levels, got {tuple(belief.shape)}")
         return sum_first(location_costs(belief.movedim((-2, -1), (0, 1)), self.level_costs))
 
 

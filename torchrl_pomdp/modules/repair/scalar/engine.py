@@ -94,6 +94,9 @@ def repair_engine(
     """
     if type(model) is not RepairModel or own.graph is not model.graph or not torch.equal(own.costs, model.costs):
         return None
+    # Locations of one kind, whose repairs work.
+    if model.chain.ndim > 2 or model.costs.ndim > 1 or model.repair_probability < 1.0:
+        return None
     rules = () if limits.truncation is None else limits.truncation.rules
     known = all(type(rule) in (AfterSteps, OnEntering, OnLeaving) for rule in rules)
     parted = all(isinstance(rule, AfterSteps) for rule in rules) or type(model.partition) in (RepairPartition, SinglePart)
