@@ -95,7 +95,15 @@ def play(of):
 
 ENVS = {
     "envs.repair.line": lambda _: case(repair.line, num_locations=(3, integers(1))),
-    "envs.repair.grid": lambda _: case(repair.grid, width=(3, integers(1)), height=(2, integers(1))),
+    "envs.repair.grid": lambda _: case(
+        repair.grid,
+        width=(3, integers(1)),
+        height=(2, integers(1)),
+        obstacles=([(1, 0)], values(None, 3, "x", [3], [(1,)], [(1, 0.5)], [(3, 0)], [(1, 0), (1, 0)], [(1, 0), (1, 1)])),
+    ),
+    "envs.repair.Graph.without_edge": lambda _: case(
+        repair.grid(2, 2).without_edge, first=(0, integers(0, 3)), second=(1, [*integers(0, 3), *values(0, 3)])
+    ),
     "envs.repair.Graph.from_slots": lambda _: case(
         Graph.from_slots,
         name=("pipe", texts()),
@@ -125,6 +133,7 @@ ENVS = {
         costs=(COSTS, tensors(COSTS, -1.0) + values((0.0, 1e39), (0.0, 1e300), ("0", "1"), (0.0, None), (0.0, 10**400))),
         discount=(0.9, numbers("(0, 1)")),
         num_robots=(1, integers(1)),
+        repair_probability=(0.5, numbers("(0, 1]")),
         terminal_probability=(0.0, numbers("[0, 1)")),
         partition=(SinglePart(), objects(SinglePart)),
         dtype=(torch.float32, dtypes()),
@@ -232,6 +241,7 @@ ENVS = {
         pessimistic_cost=(problem().pessimistic_cost, objects(greedy(), 3.0)),
         symmetries=(problem().symmetries, values((), (3,), 3, "x")),
         encoder=(problem().encoder, not_callable()),
+        agent_encoder=(problem().agent_encoder, not_callable()),
         spec=(None, mappings()),
     ),
     "problems.Problem.unpartitioned": lambda _: case(problem().unpartitioned),
@@ -316,6 +326,34 @@ MODULES = {
         y=(state(), states(state())),
         keys=(KEYS, [*keys(), Hostile("one key for two states", KEYS[:1]), Hostile("three keys", torch.arange(3))]),
         seconds=(0.001, numbers("(0, inf)")),
+    ),
+    "modules.MultiagentRollout": lambda _: case(
+        modules.MultiagentRollout, lambda made: made(state()),
+        model=belief_model(),
+        base_policy=a_policy(),
+        scheme=("autonomous", choices()),
+        signalling=(greedy(), [wrong for wrong in not_callable() if wrong.value is not None]),
+        trajectories=(1, integers(1)),
+        leaves=("control", choices()),
+        allocation=("uniform", choices()),
+        seconds=(0.001, numbers("(0, inf)")),
+        seed=(0, integers()),
+        compile=(False, flags()),
+        **simulation(),
+    ),
+    "modules.MultiagentRollout.forward": lambda _: on_tensordict(
+        modules.MultiagentRollout(model(), greedy()), (state(), states(state()))
+    ),
+    "modules.FlatAgentEncoder": lambda _: case(modules.FlatAgentEncoder, model=belief_model()),
+    "modules.repair.RobotEncoder": lambda _: case(repair_modules.RobotEncoder, model=repair_model()),
+    "modules.AgentNetwork": lambda _: case(
+        modules.AgentNetwork,
+        encoder=(modules.FlatAgentEncoder(model()), objects(FlatEncoder(model()))),
+        hidden=((4,), [*sizes(), *values(())]),
+        generator=(rng(), objects(torch.Generator)),
+    ),
+    "modules.AgentNetwork.forward": lambda _: on_entries(
+        modules.AgentNetwork(modules.FlatAgentEncoder(model()), (4,), generator=rng()), "belief", "location"
     ),
     "modules.MultistepLookahead": lambda _: case(
         modules.MultistepLookahead, lambda made: made(state()),

@@ -168,6 +168,7 @@ PROBLEMS = {
         costs=(COSTS, tensors(COSTS, -1.0)),
         discount=(0.9, numbers("(0, 1)")),
         num_robots=(1, integers(1)),
+        repair_probability=(0.5, numbers("(0, 1]")),
         start=(repair.CalibratedStart, not_callable()),
         partition=(envs.SinglePart(), objects(envs.Partition)),
         name=("mine", texts()),

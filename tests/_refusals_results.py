@@ -25,6 +25,8 @@ from _hostile import (
     terminal_costs,
     texts,
     values,
+    wrong_actions,
+    wrong_entries,
 )
 from _valid import (
     CHAIN,
@@ -39,6 +41,7 @@ from _valid import (
     callback,
     case,
     comparison,
+    env,
     greedy,
     model,
     quick_reproduce,
@@ -58,6 +61,7 @@ __all__ = ["FILES", "REPORTS"]
 RESULTS = [report.Result("greedy", comparison())]
 TITLES = values(None, 3, b"x", [], object())
 RUNS = [*mappings(), *values({"run": None}, {"run": 3}, {"run": [3]}, {"run": [{}]})]
+PLAYED = env().rollout(2, greedy())[0]
 NO_TENSORS = values(object(), {"x": object()}, len, int)
 
 REPORTS = {
@@ -109,6 +113,29 @@ REPORTS = {
             *no_states(greedy()(state()), "belief", "location"), *(Hostile("no action", state(), names=("action",)),)
         ]),
         title=("title", TITLES),
+    ),
+    "envs.repair.network_figure": lambda _: case(
+        repair.network_figure,
+        model=repair_model(),
+        y=(state()[0], [
+            *no_states(state()[0], "belief", "location"),
+            *(wrong._replace(value=wrong.value[0]) for wrong in wrong_entries(state())),
+            *values(state()),
+        ]),
+        control=("repair", values("", "no such", b"x", -1, 99, 1.5, True, [], [0, 0], [None], {}, object(), torch.ones(2))),
+        title=("title", TITLES),
+    ),
+    "envs.repair.save_animation": lambda folder: case(
+        repair.save_animation,
+        path=(folder / "a.gif", [*paths(), *values("a", "a.png")]),
+        model=repair_model(),
+        trajectories=({"greedy": PLAYED}, [
+            *mappings(),
+            *values({}, {3: PLAYED}, {"": PLAYED}, {"greedy": {}}, {"greedy": PLAYED[0]}, {"greedy": PLAYED[:0]}),
+            *(Hostile(wrong.label, {"greedy": wrong.value}) for wrong in no_states(PLAYED, "belief", "location", "action")),
+            *(Hostile(wrong.label, {"greedy": wrong.value}) for wrong in [*wrong_entries(PLAYED), *wrong_actions(PLAYED)]),
+        ]),
+        frames_per_second=(2.0, numbers("[0.1, 50]")),
     ),
     "report.interval_text": lambda _: case(report.interval_text, value=(comparison().cost, objects(comparison()))),
     "report.ratio_texts": lambda _: case(

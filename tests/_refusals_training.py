@@ -53,7 +53,7 @@ from _valid import (
 )
 
 from torchrl_pomdp import collectors, modules, objectives, trainers
-from torchrl_pomdp.modules import FlatEncoder, ZeroCost
+from torchrl_pomdp.modules import AfterSteps, FlatEncoder, ZeroCost
 from torchrl_pomdp.modules.repair import NeverRepairCost
 from torchrl_pomdp.trainers import checkpoint, run
 
@@ -154,6 +154,7 @@ TRAINERS = {
         visits_per_label=(0.5, numbers("(0, inf)")),
         learning_rate=(0.5, numbers("(0, inf)")),
         symmetries=(True, flags()),
+        multiagent=(False, flags()),
         hidden=((4,), sizes()),
         value_hidden=((4,), sizes()),
         seed=(0, seeds()),
@@ -175,7 +176,11 @@ TRAINERS = {
     ),
     "trainers.papi_nt": lambda _: an_algorithm(trainers.papi_nt),
     "trainers.papi_t": lambda _: an_algorithm(trainers.papi_t),
-    "trainers.api": lambda _: an_algorithm(trainers.api, partitioned=False),
+    "trainers.api": lambda _: an_algorithm(
+        trainers.api,
+        partitioned=False,
+        truncation=(AfterSteps(3), [wrong for wrong in objects(AfterSteps) if wrong.value is not None]),
+    ),
     "trainers.ppo": lambda _: case(
         trainers.ppo,
         problem=a_problem(),
@@ -253,8 +258,8 @@ def a_step(step):
     return case(step, parts=((0,), sequences((0,), *PARTS)), truncation=(None, objects(modules.AfterSteps)))
 
 
-def an_algorithm(algorithm, *, partitioned=True):
-    return case(algorithm, problem=a_problem(partitioned=partitioned), config=a_config(), base_policy=a_module())
+def an_algorithm(algorithm, *, partitioned=True, **more):
+    return case(algorithm, problem=a_problem(partitioned=partitioned), config=a_config(), base_policy=a_module(), **more)
 
 
 def an_architecture(make, **more):

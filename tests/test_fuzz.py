@@ -49,7 +49,8 @@ PUBLIC = (
 EXEMPT = {
     "names of types": "*.Policy *.TerminalCost *.StateGenerator *.StateSampler *.OnLabels problems.Symmetry",
     "tables and constants": "*.PRESETS *.REPAIR *.ALGORITHMS *.BASE_POLICIES *.EXPERIMENTS *.OPTIMA *.PUBLISHED *_SEED",
-    "abstract, tried by what they are bases of": "envs.Partition modules.Encoder modules.ClosedFormCost modules.Truncation",
+    "abstract, tried by what they are bases of": "envs.Partition modules.Encoder modules.AgentEncoder modules.ClosedFormCost "
+    "modules.Truncation",
     "made by the library, not by its users": "*.Comparison *.Estimate *.Iteration *.PartRecord *.Effort *.DamagedFileError "
     "*.PartitionReport *.Decision *.Interval *.Solution *.ErrorBounds",
     "run at every belief step, on what was checked before": "noise.fold noise.uniform noise.fingerprint noise.permuted",

@@ -77,6 +77,10 @@ class PolicyIterationConfig:
     """Network input: the problem's own encoding, for repair beliefs at offsets from the robot; or the flattened beliefs and
     one-hot location of the paper."""
 
+    multiagent: bool = False
+    """Whether agents, such as robots, decide one after the other, by one network that they share and with the labels of
+    multiagent rollout; always where there are too many joint controls to be enumerated."""
+
     hidden: tuple[int, ...] = (256, 64)
     """Sizes of the policy networks' hidden layers."""
 
@@ -124,7 +128,7 @@ def _checked(name: str, value: Any, hint: Any) -> Any:
         return check_choice(name, value, get_args(hint))
     if name == "seed":
         return check_seed(name, value)
-    if name == "symmetries":
+    if name in ("symmetries", "multiagent"):
         return check_flag(name, value)
     sizes = check_sizes(name, value, _WIDEST)
     if len(sizes) > _DEEPEST:

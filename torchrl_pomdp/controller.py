@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_mapping, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
@@ -23,11 +24,11 @@ class Decision(NamedTuple):
     """What to do next.
 
     Attributes:
-        control: number of the control u.
+        control: number of the control u; of many robots, whose joint controls are no numbers, each one's.
         names: its name; with several robots the name of each one's control.
     """
 
-    control: int
+    control: int | tuple[int, ...]
     names: tuple[str, ...]
 
 
@@ -142,7 +143,8 @@ class Controller:
         with torch.no_grad():
             u = controls_of("policy", self.policy, y.copy())
         self.model.check_controls(y, u)
-        return Decision(int(u), self.model.shown_control(int(u)))
+        (u,) = u
+        return Decision(int(u) if u.ndim == 0 else tuple(u.tolist()), self.model.shown_control(u))
 
     def update(self, control: Any, observation: Any) -> None:
         """Take in what was done and what was seen after it.
@@ -155,9 +157,8 @@ class Controller:
             TypeError: if one is of the wrong kind.
             ValueError: if the control is unknown or illegal, or the observation unknown or impossible after it.
         """
-        y, number = self.state, self.model.control_number(control)
-        self._check_legal(y, number)
-        u = torch.tensor(number, device=self.model.device)
+        y, u = self.state, self.model.given_control(control)
+        self._check_legal(y, u)
         self._state, self._steps = self._core(self.model.follow(y, u, observation)), self._steps + 1
 
     @property
@@ -229,16 +230,18 @@ class Controller:
     def _core(self, y: TensorDictBase) -> TensorDictBase:
         return y.select(*self.model.state_keys).clone()
 
-    def _check_legal(self, y: TensorDictBase, u: int) -> None:
+    def _check_legal(self, y: TensorDictBase, u: Tensor) -> None:
         mask = self.model.action_mask(y)
-        if not mask[u]:
-            names = [", ".join(self.model.shown_control(each)) for each in mask.nonzero().flatten().tolist()[:20]]
-            raise ValueError(
-                f"control must be legal here, got {', '.join(self.model.shown_control(u))}; legal are {'; '.join(names)}"
-            )
+        if bool(mask.gather(-1, u.unsqueeze(-1)).all()):
+            return
+        given = ", ".join(self.model.shown_control(u))
+        if u.ndim:
+            raise ValueError(f"control must be legal for every robot, got {given}; legal are {mask.int().tolist()}")
+        names = [", ".join(self.model.shown_control(each)) for each in mask.nonzero().flatten()[:20]]
+        raise ValueError(f"control must be legal here, got {given}; legal are {'; '.join(names)}")
 
 
-def _tensor(name: str, numbers: Any, dtype: torch.dtype) -> torch.Tensor:
+def _tensor(name: str, numbers: Any, dtype: torch.dtype) -> Tensor:
     """Numbers of a text as a tensor; what is no number of the type is not made one."""
     found = torch.tensor(numbers)
     if found.dtype == torch.bool or (found.is_floating_point() and not dtype.is_floating_point):

@@ -52,9 +52,13 @@ def marginals(belief, levels):
 # ---- statements of the problems, of one hidden state each ------------------------------------------------------------
 
 
-def repair(places, absorbing, size=2, costs=(0.0, 1.0, 10.0)):
-    chain = damage_chain((0.0 if absorbing else 0.25, 0.5)).tolist()
-    model = RepairModel(line(size), torch.tensor(chain), costs, 0.9, num_robots=len(places), **DOUBLE)
+def repair(places, absorbing, size=2, costs=(0.0, 1.0, 10.0), chains=None, works=1.0):
+    """``costs`` and ``chains`` of all locations, or one for each; attempts to repair work with probability ``works``."""
+    chains = damage_chain((0.0 if absorbing else 0.25, 0.5)).tolist() if chains is None else chains
+    options = {"num_robots": len(places), "repair_probability": works, **DOUBLE}
+    model = RepairModel(line(size), torch.tensor(chains), costs, 0.9, **options)
+    chain = chains if isinstance(chains[0][0], list) else [chains] * size
+    price = costs if isinstance(costs[0], tuple) else [costs] * size
     belief = torch.tensor([[0.25, 0.25, 0.5], [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]][:size], **DOUBLE)
 
     def outcomes(hidden, u):
@@ -62,10 +66,12 @@ def repair(places, absorbing, size=2, costs=(0.0, 1.0, 10.0)):
         each = [u // 3 ** (len(now) - 1 - robot) % 3 for robot in range(len(now))]
         repaired = {place for place, c in zip(now, each, strict=True) if c == 0}
         then = tuple(place + (0, -1, 1)[c] for place, c in zip(now, each, strict=True))
-        rows = [[1.0, 0.0, 0.0] if i in repaired else chain[level] for i, level in enumerate(levels)]
+        rows = [chain[i][level] for i, level in enumerate(levels)]
+        for i in repaired:
+            rows[i] = [(1.0 - works) * p + works * (k == 0) for k, p in enumerate(rows[i])]
         for nxt in product(range(3), repeat=size):
             z = sum(nxt[place] * 3 ** (len(then) - 1 - robot) for robot, place in enumerate(then))
-            yield marginals(rows, nxt), sum(costs[level] for level in levels), (nxt, then), z
+            yield marginals(rows, nxt), sum(price[i][level] for i, level in enumerate(levels)), (nxt, then), z
 
     return Tiny(
         model,
@@ -74,6 +80,14 @@ def repair(places, absorbing, size=2, costs=(0.0, 1.0, 10.0)):
         list(product(product(range(3), repeat=size), product(range(size), repeat=len(places)))),
         lambda y, hidden: marginals(y["belief"], hidden[0]) * (y["location"].tolist() == list(hidden[1])),
     )
+
+
+# Halves, so that probabilities are multiples of 1/4 where every other attempt to repair works.
+OWN_CHAINS = [
+    [[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.0, 0.0, 1.0]],
+    [[1.0, 0.0, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 0.5]],
+]
+OWN_COSTS = ((0.0, 1.0, 10.0), (0.5, 4.0, 2.0))
 
 
 def tabular(sparse):
@@ -175,6 +189,10 @@ TINY = {
     "two robots": lambda: repair((0, 1), True),
     "two robots in one place": lambda: repair((1, 1), False),
     "costs of what is intact": lambda: repair((1,), True, costs=(0.5, 1.0, 10.0)),
+    "repairs that fail": lambda: repair((0, 1), True, works=0.5),
+    "own chains and costs": lambda: repair((1,), False, costs=OWN_COSTS, chains=OWN_CHAINS),
+    "own chains and costs, repairs that fail": lambda: repair((0,), False, costs=OWN_COSTS, chains=OWN_CHAINS, works=0.5),
+    "one attempt of two robots": lambda: repair((1, 1), False, costs=OWN_COSTS, chains=OWN_CHAINS, works=0.5),
     "tabular": lambda: tabular(False),
     "sparse tabular": lambda: tabular(True),
     "rocks": rocks,
@@ -182,7 +200,8 @@ TINY = {
 }
 
 # Stages that are enumerated; 3 where nothing is said.
-STAGES = {"repair of three": 2, "two robots": 2, "two robots in one place": 2, "maintenance": 1}
+TWO_ROBOTS = ("two robots", "two robots in one place", "repairs that fail", "one attempt of two robots")
+STAGES = {"repair of three": 2, **dict.fromkeys(TWO_ROBOTS, 2), "maintenance": 1}
 
 
 # ---- by enumeration --------------------------------------------------------------------------------------------------

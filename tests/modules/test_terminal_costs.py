@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from _oracles import exact_cost, random_states, small_model
+from _oracles import exact_cost, random_states, small_model, varied_model
 from tensordict import TensorDict
 
 from torchrl_pomdp.envs.repair import RepairModel, damage_chain, line
@@ -33,6 +33,33 @@ def test_never_repairing_costs_what_3000_steps_of_degradation_cost(degradation):
     torch.testing.assert_close(cost, total, rtol=1e-10, atol=1e-9)
     single = NeverRepairCost(chain_model(degradation, dtype=torch.float32)).costs(y.clone().apply(lambda x: x.float()))
     torch.testing.assert_close(single.double(), cost, rtol=1e-4, atol=0)
+
+
+def test_never_repairing_locations_of_their_own_by_hand():
+    """One location stays as it is; the other is damaged, and then intact again, in turn."""
+    chains = torch.tensor([[[1.0, 0.0], [0.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+    model = RepairModel(line(2), chains, torch.tensor([[1.0, 3.0], [2.0, 5.0]]), 0.5, dtype=torch.float64)
+    # 1 or 3 at every stage; 2 + 5/2 + 2/4 + ... = (2 + 5/2) / (1 - 1/4), or 5 first.
+    by_level = torch.tensor([[2.0, 6.0], [6.0, 8.0]], dtype=torch.float64)
+    belief = torch.eye(2, dtype=torch.float64)[torch.cartesian_prod(torch.arange(2), torch.arange(2))]
+    y = TensorDict({"belief": belief, "location": torch.zeros(4, 1, dtype=torch.int64)}, [4])
+    expected = (belief * by_level).sum((-2, -1))
+    torch.testing.assert_close(NeverRepairCost(model).costs(y), expected, rtol=1e-12, atol=0)
+    assert SteadyStateCost(model).costs(y).tolist() == [6.0, 12.0, 10.0, 16.0]
+
+
+@pytest.mark.parametrize("works", [0.4, 1.0])
+def test_never_repairing_costs_the_sum_over_locations_of_their_own(works):
+    model = varied_model(line(4), seed=3, repair_probability=works)
+    y, total = random_states(model, 20, seed=0), torch.zeros(20, dtype=torch.float64)
+    for place, (chain, costs) in enumerate(zip(model.chain, model.costs, strict=True)):
+        belief = y["belief"][:, place]
+        for step in range(400):
+            total += 0.9**step * (belief @ costs)
+            belief = belief @ chain
+    torch.testing.assert_close(NeverRepairCost(model).costs(y), total, rtol=1e-10, atol=1e-9)
+    steady = 10 * (y["belief"] * model.costs).sum((-2, -1))
+    torch.testing.assert_close(SteadyStateCost(model).costs(y), steady, rtol=1e-12, atol=0)
 
 
 def test_never_repairing_costs_more_than_greedy_and_than_the_present_cost_forever(linear20):

@@ -143,10 +143,17 @@ class StateMemory:
             yield self._retained(y)
             u = controls_of("policy", policy, y.copy())
             model.check_controls(y, u)
-            random = random_control(y.get("action_mask"), uniform(fold(keys, _CONTROL), step))
-            u = torch.where(uniform(fold(keys, _EXPLORE), step) < exploration, random, u)
+            random = random_control(y.get("action_mask"), self._uniforms(keys, _CONTROL, step))
+            u = torch.where(self._uniforms(keys, _EXPLORE, step) < exploration, random, u)
             noise, scenarios = scenarios.draw(torch.full_like(keys, step), model.observed(y, u), 1)
             _, y = model.advance(y, u, noise)
+
+    def _uniforms(self, keys: Tensor, purpose: int, step: int) -> Tensor:
+        """A number for every control of a step, ``[N, *S]``: many agents explore each by itself."""
+        if self.model.enumerable:
+            return uniform(fold(keys, purpose), step)
+        agents = torch.arange(self.model.num_agents, device=keys.device)
+        return uniform(fold(fold(keys, purpose), step).unsqueeze(-1), agents)
 
     def _retained(self, y: TensorDictBase) -> TensorDictBase:
         """The rows of ``y`` that are retained, with their priority and part."""

@@ -7,6 +7,7 @@ from typing import Any
 
 from torchrl_pomdp.collectors.labels import LabelCollector
 from torchrl_pomdp.modules.lookahead import RolloutPolicy
+from torchrl_pomdp.modules.qfactors import SimulatedQFactors
 
 __all__ = ["RolloutImprovement"]
 
@@ -14,7 +15,8 @@ __all__ = ["RolloutImprovement"]
 class RolloutImprovement(LabelCollector):
     r"""Collector whose frames are feature states labelled with the rollout control of a base policy.
 
-    The label entries are ``action`` (the rollout control) and ``q_factors`` ``[., U]`` (costs).
+    The label entries are ``action`` (the rollout control) and ``q_factors`` ``[., U]`` (costs), or ``[., R, A]`` of
+    :class:`~torchrl_pomdp.modules.MultiagentRollout`.
 
     Args:
         args: environment and base policy, see :class:`LabelCollector`.
@@ -41,5 +43,5 @@ class RolloutImprovement(LabelCollector):
         [torch.Size([12, 3]), torch.Size([12, 3])]
     """
 
-    def __init__(self, *args: Any, label: Callable[..., RolloutPolicy] = RolloutPolicy, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, label: Callable[..., SimulatedQFactors] = RolloutPolicy, **kwargs: Any) -> None:
         super().__init__(*args, label=label, **kwargs)

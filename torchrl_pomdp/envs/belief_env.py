@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_seed
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
-from torchrl_pomdp.envs.legal import LegalControls
+from torchrl_pomdp.envs.legal import legal_controls
 
 __all__ = ["BeliefEnv"]
 
@@ -25,16 +25,16 @@ class BeliefEnv(EnvBase):
     reads them, so a transform that changes a core entry, such as ``ObservationNorm(in_keys=["belief"])``, must write to
     ``out_keys`` of its own: ``step`` raises where it finds no feature state.
 
-    ============== ============ ==========================================
+    ============== ============ ======================================================================
     key            shape        meaning
-    ============== ============ ==========================================
+    ============== ============ ======================================================================
     core entries   ``[*B, …]``  ``model.state_spec()``, e.g. ``belief``
-    action_mask    ``[*B, U]``  bool, legal controls
+    action_mask    ``[*B, U]``  bool, legal controls; of very many agents ``[*B, R, A]``, see :mod:`.controls`
     partition      ``[*B]``     int64, if the model has a partition
-    action         ``[*B]``     int64
+    action         ``[*B]``     int64; of very many agents ``[*B, R]``, TorchRL's MultiCategorical
     reward         ``[*B, 1]``  minus the expected cost
     terminated     ``[*B, 1]``  no cost follows
-    ============== ============ ==========================================
+    ============== ============ ======================================================================
 
     Args:
         model: the belief model.
@@ -89,7 +89,7 @@ class BeliefEnv(EnvBase):
         shape, device = self.batch_size, self.device
         self.observation_spec = self.model.feature_spec(shape)
         self.state_spec = self.observation_spec.clone()
-        self._controls = LegalControls(self.model.num_controls, shape=shape, device=device, generator=self.rng)
+        self._controls = legal_controls(self.model, shape, self.rng)
         self.action_spec = self._controls
         reward = Unbounded(shape=(*shape, 1), dtype=self.model.dtype, device=device)
         self.reward_spec = Composite(reward=reward, shape=shape)

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_number, check_sequence, shown
+from torchrl_pomdp.envs.controls import JointControls, check_index
 from torchrl_pomdp.envs.entries import check_state_entries
 from torchrl_pomdp.envs.names import name_of, number_of
 from torchrl_pomdp.envs.partition import Partition
@@ -39,7 +40,7 @@ StateGenerator = Callable[[Tensor], TensorDictBase]
 """Distribution of feature states: maps int64 keys ``[*B]`` to feature states ``[*B]``, the same key to the same state."""
 
 
-class BeliefModel(nn.Module, ABC):
+class BeliefModel(JointControls, ABC):
     r"""A POMDP seen through its feature state :math:`y` (paper, Section II), as batched pure tensor functions.
 
     Feature states are TensorDicts of any batch shape ``[*B]``. Their *core* entries (:attr:`state_keys`) determine the
@@ -73,7 +74,6 @@ class BeliefModel(nn.Module, ABC):
     """
 
     state_keys: tuple[str, ...]
-    num_controls: int
     num_observations: int
     noise_dim: int = 1
     max_cost: float | None = None
@@ -168,7 +168,7 @@ class BeliefModel(nn.Module, ABC):
 
     @abstractmethod
     def action_mask(self, y: TensorDictBase) -> Tensor:
-        """U(y): bool ``[*B, U]``, True where a control is legal; at least one is."""
+        """U(y): bool ``[*B, U]``, True where a control is legal; at least one is. See :mod:`.controls` for many agents."""
 
     @abstractmethod
     def expected_cost(self, y: TensorDictBase, u: Tensor) -> Tensor:
@@ -251,7 +251,9 @@ class BeliefModel(nn.Module, ABC):
         """Specs of core and derived entries."""
         spec = self.state_spec(batch_size)
         shape = torch.Size(batch_size)
-        spec["action_mask"] = Binary(self.num_controls, shape=(*shape, self.num_controls), dtype=torch.bool, device=self.device)
+        count = self.control_range
+        mask = (*shape, *self.control_shape, count)
+        spec["action_mask"] = Binary(count, shape=mask, dtype=torch.bool, device=self.device)
         if self.partition is not None:
             spec["partition"] = Categorical(self.partition.num_parts, shape=shape, dtype=torch.int64, device=self.device)
         return spec
@@ -267,31 +269,6 @@ class BeliefModel(nn.Module, ABC):
         """
         check_state_entries("y", y, self.state_spec(), "a feature state")
 
-    def check_controls(self, y: TensorDictBase, u: Tensor) -> None:
-        """Raise unless ``u`` are legal controls in ``y``; its ``"action_mask"`` is believed if it has one.
-
-        Args:
-            y: feature states ``[*B]``.
-            u: controls, int64 ``[*B]``.
-
-        Raises:
-            TypeError: if ``u`` is no tensor.
-            ValueError: if its type or shape is another, or a control is illegal; the message lists the legal ones.
-        """
-        _check_index("action", u, y.batch_size)
-        mask = y.get("action_mask", None)
-        mask = self.action_mask(y) if mask is None else mask
-        low, high = u.aminmax() if u.numel() else (0, 0)
-        if low >= 0 and high < self.num_controls and mask.gather(-1, u.unsqueeze(-1)).all():
-            return
-        known = (u >= 0) & (u < self.num_controls)
-        index = u.clamp(0, self.num_controls - 1).unsqueeze(-1)
-        where = (~(known & mask.gather(-1, index).squeeze(-1))).nonzero()[0].tolist()
-        raise ValueError(
-            f"action {int(u[tuple(where)])} at batch index {tuple(where)} is illegal; "
-            f"legal there: {mask[tuple(where)].nonzero().flatten().tolist()}"
-        )
-
     def check_observations(self, y: TensorDictBase, z: Tensor) -> None:
         """Raise unless ``z`` ``[*B]`` are observations of this model, whether possible in ``y`` ``[*B]`` or not.
 
@@ -299,7 +276,7 @@ class BeliefModel(nn.Module, ABC):
             TypeError: if ``z`` is no tensor.
             ValueError: if its type or shape is another, or a number is out of range.
         """
-        _check_index("observation", z, y.batch_size)
+        check_index("observation", z, y.batch_size)
         if z.numel():
             low, high = z.aminmax()
             if low < 0 or high >= self.num_observations:
@@ -352,13 +329,13 @@ class BeliefModel(nn.Module, ABC):
 
     # ---- what a real robot does and reports, see torchrl_pomdp.controller ---------------------------------------------
 
-    def shown_control(self, u: int) -> tuple[str, ...]:
-        """Names of control ``u``, one for each robot; its number where the model has no names."""
-        return (name_of(u, self.control_names),)
+    def shown_control(self, u: Tensor) -> tuple[str, ...]:
+        """Names of control ``u`` ``[*S]``, one for each robot; its number where the model has no names."""
+        return (name_of(int(u), self.control_names),)
 
-    def control_number(self, control: Any) -> int:
-        """The control that is given by number or name; raises as :func:`~torchrl_pomdp.envs.names.number_of` does."""
-        return number_of("control", control, self.control_names, self.num_controls)
+    def given_control(self, control: Any) -> Tensor:
+        """The control ``[*S]`` that is given by number or name; raises as :func:`~torchrl_pomdp.envs.names.number_of` does."""
+        return torch.tensor(number_of("control", control, self.control_names, self.num_controls), device=self.device)
 
     def condition(self, y: TensorDictBase, observation: Any) -> TensorDictBase:
         """The state ``y``, of batch ``()``, after a look before the first control. Most models have none and refuse."""
@@ -396,9 +373,3 @@ def generated(generator: StateGenerator, keys: Tensor, name: str = "generator") 
     if y.batch_size != keys.shape:
         raise ValueError(f"{name} must give one state for each key, {tuple(keys.shape)}, got batch {tuple(y.batch_size)}")
     return y
-
-
-def _check_index(name: str, value: Any, shape: torch.Size) -> None:
-    check_instance(name, value, Tensor)
-    if value.shape != shape or value.dtype != torch.int64:
-        raise ValueError(f"{name} must be int64 of shape {tuple(shape)}, got {value.dtype} of shape {tuple(value.shape)}")

@@ -6,6 +6,7 @@ the starts of environments and evaluations and the training states of each part 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -167,23 +168,24 @@ class RandomPlay:
         model, flat = self.model, check_keys("keys", keys).reshape(-1)
         y = model.drawn(self.start, flat, "start").select(*model.state_keys)
         length = (uniform(fold(flat, _LENGTH), 0) * (self.max_stages + 1)).to(torch.int64)
-        u = torch.full_like(flat, -1)
+        u = torch.full((*flat.shape, *model.control_shape), -1, device=flat.device)
+        numbers = torch.arange(model.noise_dim + 1 + math.prod(model.control_shape), device=flat.device)
         for stage in range(self.max_stages):
             live = ((length > stage) & ~model.is_terminal(y)).nonzero().squeeze(-1)
             if not live.numel():
                 break
             now = take_rows(y, live)
-            noise = uniform(
-                fold(fold(flat[live], _PLAY), stage).unsqueeze(-1), torch.arange(model.noise_dim + 2, device=flat.device)
-            )
-            u[live] = self._controls(model.action_mask(now), u[live], noise[:, -2], noise[:, -1])
-            y = put_rows(y, live, model.advance(now, u[live], noise[:, :-2])[1])
+            noise = uniform(fold(fold(flat[live], _PLAY), stage).unsqueeze(-1), numbers)
+            seen, keep, draw = noise.split([model.noise_dim, 1, len(numbers) - model.noise_dim - 1], -1)
+            u[live] = self._controls(model.action_mask(now), u[live], keep.squeeze(-1), draw)
+            y = put_rows(y, live, model.advance(now, u[live], seen)[1])
         return y.view(keys.shape)
 
     def _controls(self, mask: Tensor, last: Tensor, keep: Tensor, draw: Tensor) -> Tensor:
-        """The last controls ``[N]`` where they are legal and kept, else others of the ``mask`` ``[N, U]``."""
-        kept = (last >= 0) & (keep < _KEPT) & mask.gather(-1, last.clamp_min(0).unsqueeze(-1)).squeeze(-1)
-        return torch.where(kept, last, random_control(mask, draw))
+        """The last controls ``[N, *S]`` where they are legal and kept, else others of the ``mask`` ``[N, *S, n]``."""
+        legal = mask.gather(-1, last.clamp_min(0).unsqueeze(-1)).squeeze(-1)
+        kept = (last >= 0) & legal & (keep < _KEPT).view(-1, *[1] * (last.ndim - 1))
+        return torch.where(kept, last, random_control(mask, draw.view(last.shape)))
 
 
 class FixedBelief:

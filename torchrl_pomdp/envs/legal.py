@@ -19,14 +19,15 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite, TensorSpec
+from torchrl.data import Categorical, Composite, MultiCategorical, TensorSpec
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 from torchrl.modules import RandomPolicy
 
+from torchrl_pomdp.envs.controls import JointControls
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.noise import fold
 
-__all__ = ["LegalControls"]
+__all__ = ["LegalAgentControls", "LegalControls", "LegalSpec", "legal_controls"]
 
 
 class _Current:
@@ -44,7 +45,90 @@ class _Current:
         return self.generator
 
 
-class LegalControls(Categorical):
+class LegalSpec(TensorSpec):
+    """What specs of legal controls have in common: random ones are legal in the current states, whose mask all copies share."""
+
+    _current: _Current
+
+    @property
+    def _count(self) -> int:
+        """What every control is below."""
+        raise NotImplementedError
+
+    def update_mask(self, mask: Tensor | None) -> None:
+        """Set the legal controls of the current states: bool ``[*B, *S, n]``; None keeps what is known."""
+        # TorchRL's own mask stays unset: it would have to fit the spec's shape, and would refuse stored actions.
+        self.mask = None
+        if mask is not None:
+            self.show(mask)
+
+    def show(self, mask: Tensor, changed: Tensor | None = None) -> None:
+        """Tell all copies the legal controls ``[*B, *S, n]`` of the current states, of what has ``changed`` ``[*B, 1]``."""
+        known = self._current.mask
+        if changed is not None and known is not None and known.shape == mask.shape:
+            mask = torch.where(changed.view(*changed.shape[:-1], *[1] * (mask.ndim - changed.ndim + 1)), mask, known)
+        self._current.mask = mask
+
+    def reseed(self, seed: int | None) -> None:
+        """Seed the random numbers of all copies; None: by the operating system."""
+        generator = self._current.source(self.device)
+        if seed is None:
+            generator.seed()
+        else:
+            # Another stream than that of an environment with the same seed.
+            generator.manual_seed(int(fold(torch.tensor(seed), 1)) & (2**63 - 1))
+
+    def rand(self, shape: torch.Size | tuple[int, ...] | None = None) -> Tensor:
+        """Random legal controls of the current states; any control if their batch is not that of what is drawn."""
+        size = torch.Size([*(shape or ()), *self.shape])
+        generator, mask = self._current.source(self.device), self._current.mask
+        if mask is None or mask.shape[:-1] not in ((), size):
+            return torch.randint(self._count, size, generator=generator, device=generator.device).to(self.device, self.dtype)
+        noise = torch.rand(size, generator=generator, dtype=torch.float32, device=generator.device)
+        weights = mask.to(generator.device, noise.dtype).expand(*size, self._count)
+        return inverse_cdf(weights, noise).to(self.device, self.dtype)
+
+    # Copies share what is current.
+
+    def _sharing(self, copy: Any) -> Any:
+        copy._current = self._current
+        return copy
+
+    def clone(self) -> Any:
+        """A copy; see :class:`~torchrl.data.Categorical`, also for what follows."""
+        return self._sharing(super().clone())
+
+    def to(self, dest: Any) -> Any:
+        """A copy on a device or of a type."""
+        return self._sharing(super().to(dest))
+
+    def expand(self, *shape: Any) -> Any:
+        """A copy of a larger batch."""
+        return self._sharing(super().expand(*shape))
+
+    def squeeze(self, dim: int | None = None) -> Any:
+        """A copy without a dimension of size one."""
+        return self._sharing(super().squeeze(dim))
+
+    def unsqueeze(self, dim: int) -> Any:
+        """A copy with one more dimension of size one."""
+        return self._sharing(super().unsqueeze(dim))
+
+    def unbind(self, dim: int = 0) -> tuple[Any, ...]:
+        """A copy for each index of a dimension."""
+        return tuple(self._sharing(copy) for copy in super().unbind(dim))
+
+    def __getitem__(self, idx: Any) -> Any:
+        return self._sharing(super().__getitem__(idx))
+
+    def _reshape(self, shape: Any) -> Any:
+        return self._sharing(super()._reshape(shape))
+
+    def _unflatten(self, dim: int, sizes: Any) -> Any:
+        return self._sharing(super()._unflatten(dim, sizes))
+
+
+class LegalControls(LegalSpec, Categorical):
     """Action spec that draws legal controls of the current states.
 
     Any control of the model is *in* the spec, as stored actions belong to other states than the current ones.
@@ -80,83 +164,70 @@ class LegalControls(Categorical):
         self._current = _Current(generator)
         super().__init__(n, shape, device, dtype, mask)
 
-    def update_mask(self, mask: Tensor | None) -> None:
-        """Set the legal controls of the current states: bool ``[*B, U]``; None keeps what is known."""
-        # TorchRL's own mask stays unset: it would have to fit the spec's shape, and would refuse stored actions.
-        self.mask = None
-        if mask is not None:
-            self.show(mask)
-
-    def show(self, mask: Tensor, changed: Tensor | None = None) -> None:
-        """Tell all copies the legal controls ``[*B, U]`` of the current states, of those that have ``changed`` ``[*B, 1]``."""
-        known = self._current.mask
-        if changed is not None and known is not None and known.shape == mask.shape:
-            mask = torch.where(changed, mask, known)
-        self._current.mask = mask
-
-    def reseed(self, seed: int | None) -> None:
-        """Seed the random numbers of all copies; None: by the operating system."""
-        generator = self._current.source(self.device)
-        if seed is None:
-            generator.seed()
-        else:
-            # Another stream than that of an environment with the same seed.
-            generator.manual_seed(int(fold(torch.tensor(seed), 1)) & (2**63 - 1))
-
-    def rand(self, shape: torch.Size | tuple[int, ...] | None = None) -> Tensor:
-        """Random legal controls of the current states; any control if their batch is not that of what is drawn."""
-        size = torch.Size([*(shape or ()), *self.shape])
-        generator, mask = self._current.source(self.device), self._current.mask
-        if mask is None or mask.shape[:-1] not in ((), size):
-            return torch.randint(self.n, size, generator=generator, device=generator.device).to(self.device, self.dtype)
-        noise = torch.rand(size, generator=generator, dtype=torch.float32, device=generator.device)
-        weights = mask.to(generator.device, noise.dtype).expand(*size, self.n)
-        return inverse_cdf(weights, noise).to(self.device, self.dtype)
-
-    # Copies share what is current.
-
-    def _sharing(self, copy: LegalControls) -> LegalControls:
-        copy._current = self._current
-        return copy
-
-    def clone(self) -> LegalControls:
-        """A copy; see :class:`~torchrl.data.Categorical`, also for what follows."""
-        return self._sharing(super().clone())
-
-    def to(self, dest: Any) -> LegalControls:
-        """A copy on a device or of a type."""
-        return self._sharing(super().to(dest))
-
-    def expand(self, *shape: Any) -> LegalControls:
-        """A copy of a larger batch."""
-        return self._sharing(super().expand(*shape))
-
-    def squeeze(self, dim: int | None = None) -> LegalControls:
-        """A copy without a dimension of size one."""
-        return self._sharing(super().squeeze(dim))
-
-    def unsqueeze(self, dim: int) -> LegalControls:
-        """A copy with one more dimension of size one."""
-        return self._sharing(super().unsqueeze(dim))
-
-    def unbind(self, dim: int = 0) -> tuple[LegalControls, ...]:
-        """A copy for each index of a dimension."""
-        return tuple(self._sharing(copy) for copy in super().unbind(dim))
-
-    def __getitem__(self, idx: Any) -> LegalControls:
-        return self._sharing(super().__getitem__(idx))
-
-    def _reshape(self, shape: Any) -> LegalControls:
-        return self._sharing(super()._reshape(shape))
-
-    def _unflatten(self, dim: int, sizes: Any) -> LegalControls:
-        return self._sharing(super()._unflatten(dim, sizes))
+    @property
+    def _count(self) -> int:
+        return self.n
 
 
-def _legal(spec: TensorSpec | None) -> Iterator[LegalControls]:
+class LegalAgentControls(LegalSpec, MultiCategorical):
+    """Action spec of many agents: draws a legal control for each of them, see :class:`LegalControls`.
+
+    Args:
+        nvec: the numbers of controls of the agents, all equal.
+        shape: shape of the actions, ``[*B, R]``.
+        device: where actions are.
+        dtype: type of actions.
+        mask: legal controls of the current states, bool ``[*B, R, A]``, see :meth:`update_mask`.
+        remove_singleton: as TorchRL has it.
+
+    Keyword Args:
+        generator: source of the random numbers; None makes one that is seeded by the operating system.
+
+    Examples:
+        >>> spec = LegalAgentControls([3, 3])
+        >>> spec.update_mask(torch.tensor([[False, True, False], [False, False, True]]))
+        >>> spec.rand()
+        tensor([1, 2])
+    """
+
+    def __init__(
+        self,
+        nvec: Any,
+        shape: torch.Size | None = None,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype = torch.int64,
+        mask: Tensor | None = None,
+        remove_singleton: bool = False,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self._current = _Current(generator)
+        super().__init__(nvec, shape, device, dtype, mask, remove_singleton)
+
+    @property
+    def _count(self) -> int:
+        return int(self.nvec.flatten()[0])
+
+
+def legal_controls(model: JointControls, batch: torch.Size, generator: torch.Generator) -> LegalControls | LegalAgentControls:
+    """The action spec of a model: numbers of joint controls, or one control for each of many agents.
+
+    Args:
+        model: the belief model.
+        batch: shape of the environment's batch.
+        generator: source of the random numbers.
+    """
+    shape = torch.Size([*batch, *model.control_shape])
+    if model.enumerable:
+        return LegalControls(model.num_controls, shape=shape, device=generator.device, generator=generator)
+    each = [model.num_agent_controls] * model.num_agents
+    return LegalAgentControls(each, shape=shape, device=generator.device, generator=generator)
+
+
+def _legal(spec: TensorSpec | None) -> Iterator[LegalSpec]:
     """The specs of legal controls in an action spec."""
     for leaf in spec.values(True, True) if isinstance(spec, Composite) else (spec,):
-        if isinstance(leaf, LegalControls):
+        if isinstance(leaf, LegalSpec):
             yield leaf
 
 

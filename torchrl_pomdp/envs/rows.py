@@ -34,11 +34,11 @@ def random_control(mask: Tensor, noise: Tensor) -> Tensor:
     """A legal control, each as probable as another.
 
     Args:
-        mask: legal controls, bool ``[*B, U]``, at least one in a row.
-        noise: uniforms in [0, 1), ``[*B]``.
+        mask: legal controls, bool ``[*B, *S, n]``, at least one in a row, see :mod:`~torchrl_pomdp.envs.controls`.
+        noise: uniforms in [0, 1), ``[*B, *S]``.
 
     Returns:
-        controls, int64 ``[*B]``.
+        controls, int64 ``[*B, *S]``.
 
     Examples:
         >>> import torch

@@ -11,7 +11,7 @@ from torchrl.envs import Transform
 
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.envs.legal import LegalControls
+from torchrl_pomdp.envs.legal import LegalSpec
 
 __all__ = ["TrackBelief"]
 
@@ -124,7 +124,7 @@ class TrackBelief(Transform):
         terminated = self.model.is_terminal(y).unsqueeze(-1)
         tensordict.update({"terminated": terminated, "done": terminated | tensordict.get("truncated")})
         controls = self.container.full_action_spec["action"]
-        if isinstance(controls, LegalControls):
+        if isinstance(controls, LegalSpec):
             controls.show(y.get("action_mask"), changed)
         return tensordict
 

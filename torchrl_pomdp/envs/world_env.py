@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_seed
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
-from torchrl_pomdp.envs.legal import LegalControls
+from torchrl_pomdp.envs.legal import legal_controls
 
 __all__ = ["WorldEnv"]
 
@@ -90,7 +90,7 @@ class WorldEnv(EnvBase):
         model, shape, device = self.model, self.batch_size, self.device
         observation = Categorical(model.num_observations + 1, shape=shape, dtype=torch.int64, device=device)
         self.observation_spec = Composite(observation=observation, prior=model.state_spec(shape), shape=shape, device=device)
-        self._controls = LegalControls(model.num_controls, shape=shape, device=device, generator=self.rng)
+        self._controls = legal_controls(model, shape, self.rng)
         self.action_spec = self._controls
         self.reward_spec = Composite(reward=Unbounded(shape=(*shape, 1), dtype=model.dtype, device=device), shape=shape)
         flags = {

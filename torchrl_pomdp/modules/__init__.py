@@ -1,8 +1,10 @@
 """Policies, rollout, lookahead and partitioned networks (paper, Sections III to VI)."""
 
+from torchrl_pomdp.modules.agents import AgentEncoder, AgentNetwork, FlatAgentEncoder
 from torchrl_pomdp.modules.base_policies import Myopic, as_policy
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.lookahead import RolloutPolicy
+from torchrl_pomdp.modules.multiagent import MultiagentRollout
 from torchrl_pomdp.modules.multistep import MultistepLookahead
 from torchrl_pomdp.modules.networks import PolicyNetwork, ValueNetwork
 from torchrl_pomdp.modules.parallel import ParallelRollout
@@ -13,10 +15,14 @@ from torchrl_pomdp.modules.truncation import AfterSteps, OnEntering, OnLeaving, 
 
 __all__ = [
     "AfterSteps",
+    "AgentEncoder",
+    "AgentNetwork",
     "ClosedFormCost",
     "ConstantCost",
     "Encoder",
+    "FlatAgentEncoder",
     "FlatEncoder",
+    "MultiagentRollout",
     "MultistepLookahead",
     "Myopic",
     "OnEntering",

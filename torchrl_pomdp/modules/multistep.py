@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.rows import inverse_cdf, take_rows
-from torchrl_pomdp.modules.lookahead import RolloutPolicy, cheapest, check_q_factors
+from torchrl_pomdp.modules.lookahead import RolloutPolicy
+from torchrl_pomdp.modules.qfactors import cheapest, check_q_factors
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import check_distributions
 

@@ -2,7 +2,6 @@ r"""Policy and value networks, :math:`\hat\mu(y,r)` and :math:`\hat J(y,r)` (pap
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, cast
@@ -24,7 +23,7 @@ from torchrl_pomdp.tensor_checks import check_entries
 if TYPE_CHECKING:
     from torchrl.modules import ProbabilisticActor
 
-__all__ = ["LocalNetwork", "PolicyNetwork", "ValueNetwork", "evaluate_networks"]
+__all__ = ["LocalNetwork", "PolicyNetwork", "ValueNetwork", "check_finite_output", "evaluate_networks"]
 
 
 class LocalNetwork(TensorDictModuleBase):
@@ -69,13 +68,13 @@ class LocalNetwork(TensorDictModuleBase):
         return local_engine([self], model, limits)
 
     @property
-    def kind(self) -> tuple[Any, ...]:
-        """What networks have in common that can be evaluated together."""
+    def kind(self) -> tuple[Any, ...] | None:
+        """What networks have in common that can be evaluated together; None for one that is evaluated alone."""
         return type(self), self.encoder
 
-    @abstractmethod
     def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
-        """What the outputs ``[M, .]`` of the last layer mean at feature states ``y`` ``[M]``."""
+        """What the outputs ``[M, .]`` of the last layer mean at feature states ``y`` ``[M]``, for networks with a kind."""
+        raise NotImplementedError
 
 
 class PolicyNetwork(LocalNetwork):
@@ -114,7 +113,7 @@ class PolicyNetwork(LocalNetwork):
         logits = output.masked_fill(~y.get("action_mask"), -torch.inf)
         best, action = logits.max(-1)
         # One check for all: of NaN, of infinite logits, and of a state without a legal control.
-        _check_finite("logits", best)
+        check_finite_output("logits", best)
         return TensorDict({"logits": logits, "action": action}, y.batch_size)
 
     def actor(self) -> ProbabilisticActor:
@@ -200,12 +199,12 @@ class ValueNetwork(LocalNetwork):
     @property
     def kind(self) -> tuple[Any, ...]:
         """What networks have in common that can be evaluated together: the scale, too."""
-        return *super().kind, self.scale
+        return type(self), self.encoder, self.scale
 
     def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
         """``"state_value"``; see the class."""
         value = output.squeeze(-1) * self.scale.costs(y)
-        _check_finite("state_value", value)
+        check_finite_output("state_value", value)
         return TensorDict({"state_value": value}, y.batch_size)
 
 
@@ -229,7 +228,8 @@ def evaluate_networks(
     return networks[0].entries(torch.cat(outputs), take_rows(y.select(*networks[0].entry_keys), rows))
 
 
-def _check_finite(name: str, values: Tensor) -> None:
+def check_finite_output(name: str, values: Tensor) -> None:
+    """Raise unless what a network gives is finite; called ``name`` in messages."""
     if not transformed() and not bool(torch.isfinite(values).all()):
         wrong = values[~torch.isfinite(values)][0].item()
         raise ValueError(

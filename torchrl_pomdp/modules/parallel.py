@@ -11,7 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance, shown
-from torchrl_pomdp.modules.lookahead import RolloutPolicy, cheapest
+from torchrl_pomdp.modules.lookahead import RolloutPolicy
+from torchrl_pomdp.modules.qfactors import cheapest
 
 __all__ = ["ParallelRollout"]
 

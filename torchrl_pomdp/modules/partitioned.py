@@ -70,7 +70,7 @@ class _Partitioned(TensorDictModuleBase):
     def _route(self, y: TensorDictBase, part: Tensor, members: list[Any]) -> TensorDictBase:
         """Entries at the rows of ``y`` ``[N]``, each by the member of its part ``[N]``."""
         distinct = list(dict.fromkeys(members))
-        networks = [member for member in distinct if isinstance(member, LocalNetwork)]
+        networks = [member for member in distinct if isinstance(member, LocalNetwork) and member.kind is not None]
         networks = networks if len({network.kind for network in networks}) == 1 else []
         if len(distinct) == 1 and not networks:
             return distinct[0](y).select(*self.out_keys)

@@ -338,7 +338,7 @@ class TruncatedRollout(nn.Module):
         """Discounted stage cost ``[N]``, next feature states and scenarios of rows that have made ``age`` ``[N]`` steps."""
         u = controls_of("base_policy", self.base_policy, y)
         if not torch.compiler.is_compiling():
-            _check_range(u, self.model.num_controls)
+            _check_range(u, self.model)
         noise, scenarios = scenarios.draw(age, self.model.observed(y, u), count)
         cost, nxt = self.model.advance(y, u, noise)
         return cost * self._discounts[age], nxt, scenarios
@@ -373,11 +373,12 @@ def _check_rest(model: BeliefModel, max_steps: int, truncation: Truncation | Non
         )
 
 
-def _check_range(u: Tensor, num_controls: int) -> None:
+def _check_range(u: Tensor, model: BeliefModel) -> None:
     """Raise unless ``u`` are controls of the model: others would be taken for some of these."""
     low, high = u.aminmax() if u.numel() else (0, 0)
-    if u.dtype != torch.int64 or not 0 <= int(low) <= int(high) < num_controls:
-        raise ValueError(f"base_policy must write int64 actions 0..{num_controls - 1}, got {u.dtype} from {low} to {high}")
+    if u.dtype != torch.int64 or not 0 <= int(low) <= int(high) < model.control_range:
+        allowed = f"0..{model.control_range - 1}"
+        raise ValueError(f"base_policy must write int64 actions {allowed}, got {u.dtype} from {low} to {high}")
 
 
 def _read_by(reader: Policy | TerminalCost) -> tuple[str, ...] | None:

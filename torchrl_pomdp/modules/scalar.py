@@ -144,15 +144,22 @@ class ScalarEngine(SearchEngine):
 
     @abstractmethod
     def q_factors(
-        self, y: TensorDictBase, keys: Tensor | None, seed: int, allocation: Allocation
+        self,
+        y: TensorDictBase,
+        keys: Tensor | None,
+        seed: int,
+        allocation: Allocation,
+        controls: NDArray[np.int64] | None = None,
     ) -> tuple[NDArray[np.float64], int]:
-        """Q-factors ``[N, U]`` of states of batch ``[*B]``, infinite where a control is illegal, and the number of steps.
+        """Q-factors ``[N, C]`` of states of batch ``[*B]``, infinite where a control is illegal, and the number of steps.
 
         Args:
             y: feature states.
             keys: keys of their scenarios, ``[N]``; None: as ``RolloutPolicy.keys`` gives them.
             seed: seed of these.
             allocation: how trajectories are spent.
+            controls: the candidates, each the controls of R parts, such as robots, ``[N, C, R]``, C at least 1; None: all joint
+                controls in their order.
 
         Raises:
             TypeError: by ``BeliefModel.check_state``.

@@ -3,7 +3,7 @@ r"""Training a policy network on rollout controls is a classification problem (p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_choice, check_instance
+from torchrl_pomdp.modules.agents import AgentNetwork
 from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of
 
 __all__ = ["ClassificationLoss"]
@@ -35,6 +36,10 @@ class ClassificationLoss(LabelLoss):
       learns from all Q-factors and averages their noise over the states. The unit is the geometric mean of two standard
       deviations of the Q-factors, the state's and the mean of the batch's: by the state's alone rare large costs, which
       raise it, would count for too little, by the batch's alone the noisiest states would count for all.
+
+    An :class:`~torchrl_pomdp.modules.AgentNetwork` learns from the labels of
+    :class:`~torchrl_pomdp.modules.MultiagentRollout`, Q-factors ``[*B, R, A]``: each agent's decision counts as a state, and
+    agents are told the labels of the earlier ones.
 
     Args:
         policy: policy that writes ``"logits"``; a :class:`~torchrl_pomdp.modules.PolicyNetwork` or a partitioned one.
@@ -89,13 +94,19 @@ class ClassificationLoss(LabelLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss and metrics of labelled states ``[*B]``; see the class."""
         batch = check_batch(tensordict, self.in_keys)
-        label = label_of(batch, self.tensor_keys.action, 1, floating=False)
-        q_factors = label_of(batch, self.tensor_keys.q_factors, 2, floating=True)
+        y = batch.select(*self.policy.in_keys)
+        if isinstance(self.policy, AgentNetwork):
+            label = self._told(batch)
+            y.set("told", label)
+        else:
+            label = label_of(batch, self.tensor_keys.action, 1, floating=False)
+        q_factors = label_of(batch, self.tensor_keys.q_factors, label.ndim + 1, floating=True)
         with self.policy_params.to_module(self.policy, preserve_module_state=False):
-            output = self.policy(batch.select(*self.policy.in_keys))
-        logits = output.get("logits")
+            logits = self.policy(y).get("logits")
         if logits.shape != q_factors.shape:
             raise ValueError(f"q_factors must have the logits' shape {tuple(logits.shape)}, got {tuple(q_factors.shape)}")
+        # Each agent's decision is a row.
+        label, q_factors, logits = label.flatten(), q_factors.flatten(0, -2), logits.flatten(0, -2)
         gaps = _gaps(q_factors, label)
         chosen = logits.detach().argmax(-1)
         return TensorDict(
@@ -105,6 +116,14 @@ class ClassificationLoss(LabelLoss):
                 "regret": gaps.gather(-1, chosen.unsqueeze(-1)).mean(),
             }
         )
+
+    def _told(self, batch: TensorDictBase) -> Tensor:
+        """The labels of a network for many agents, their controls ``[N, R]``."""
+        model = cast(AgentNetwork, self.policy).model
+        label = label_of(batch, self.tensor_keys.action, 1 + len(model.control_shape), floating=False)
+        if not bool(((label >= 0) & (label < model.control_range)).all()):
+            raise ValueError("action must be a legal control, one with a finite Q-factor, got another")
+        return model.split_controls(label)
 
 
 def _gaps(q_factors: Tensor, label: Tensor) -> Tensor:

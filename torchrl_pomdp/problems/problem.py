@@ -14,6 +14,7 @@ from torchrl_pomdp.checks import check_callable, check_instance, check_label, ch
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.generators import InPart, Mixture, RandomPlay
 from torchrl_pomdp.envs.partition import Partition, SinglePart
+from torchrl_pomdp.modules.agents import AgentEncoder, FlatAgentEncoder
 from torchrl_pomdp.modules.base_policies import Myopic, as_policy
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.rollout import Policy
@@ -54,6 +55,8 @@ class Problem:
         symmetries: renamings under which labels stay labels, the identity first. By default the identity alone.
         encoder: what makes the encoder of the networks from the model. By default
             :class:`~torchrl_pomdp.modules.FlatEncoder`.
+        agent_encoder: what makes the encoder of networks that many agents share. By default
+            :class:`~torchrl_pomdp.modules.FlatAgentEncoder`.
         spec: plain JSON from which the problem can be built again, see :func:`~torchrl_pomdp.problems.problem_from_spec`;
             None for a problem of the user's own code, which is given back when a checkpoint is loaded.
 
@@ -79,12 +82,14 @@ class Problem:
     pessimistic_cost: ClosedFormCost = _DEFAULT
     symmetries: Sequence[Symmetry] = (identity_symmetry,)
     encoder: Callable[[Any], Encoder] = FlatEncoder
+    agent_encoder: Callable[[Any], AgentEncoder] = FlatAgentEncoder
     spec: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         check_label("name", self.name)
         check_callable("start", self.start)
         check_callable("encoder", self.encoder)
+        check_callable("agent_encoder", self.agent_encoder)
         model = check_instance("model", self.model, BeliefModel)
         if model.partition is None:
             model = model.with_partition(SinglePart())

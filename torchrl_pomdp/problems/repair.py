@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_sequence, shown
 from torchrl_pomdp.envs.belief_model import StateGenerator
 from torchrl_pomdp.envs.generators import InPart
-from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.envs.partition import Partition, SinglePart
 from torchrl_pomdp.envs.repair import (
     CalibratedStart,
     Graph,
@@ -25,7 +26,14 @@ from torchrl_pomdp.envs.repair import (
     line,
     symmetries,
 )
-from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, UrgencyRepair
+from torchrl_pomdp.modules.repair import (
+    GreedyRepair,
+    NeverRepairCost,
+    RelativeEncoder,
+    RobotEncoder,
+    SteadyStateCost,
+    UrgencyRepair,
+)
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.tensor_checks import check_device
 
@@ -34,6 +42,19 @@ __all__ = ["REPAIR_PRESETS", "repair_problem"]
 COSTS = (0.0, 0.1, 1.0, 10.0, 100.0)
 DEGRADATION = (0.0, 0.02, 0.03, 0.05)
 DISCOUNT = 0.99
+_NETWORK32 = (
+    "1-2 1-32 2-3 2-4 3-4 3-32 4-5 4-6 5-6 5-8 6-7 6-32 7-17 8-9 8-12 9-10 9-12 10-11 11-12 11-13 12-14 13-15 14-24 14-15 "
+    "15-16 16-17 16-19 16-20 17-19 17-18 18-21 18-22 18-23 19-21 20-21 21-22 23-25 23-26 24-25 25-26 26-28 25-27 27-28 27-29 "
+    "27-30 28-29 29-30 30-31 31-32"
+)
+# Where its locations are drawn, without crossings.
+_PLACES = (
+    *((3.5, 1.1), (2.5, 1.1), (3.1, 0.0), (1.5, 1.0), (1.4, 2.4), (2.8, 2.1), (3.4, 2.9), (0.0, 3.6)),
+    *((0.8, 4.2), (1.5, 3.5), (1.4, 5.0), (0.5, 5.5), (2.1, 4.3), (2.4, 6.6), (2.0, 5.7), (2.7, 5.0)),
+    *((3.6, 3.9), (4.6, 4.6), (3.7, 4.9), (3.0, 5.9), (4.0, 5.8), (5.0, 5.7), (5.6, 4.9), (4.6, 6.6)),
+    *((6.3, 5.6), (6.4, 4.4), (7.3, 4.0), (5.8, 3.6), (6.7, 3.0), (7.2, 2.2), (5.7, 1.7), (4.5, 1.2)),
+)
+_OBSTACLES = ((1, 1), (1, 2), (3, 1), (4, 3), (4, 4), (2, 4))
 
 
 def repair_problem(
@@ -43,6 +64,7 @@ def repair_problem(
     discount: float,
     *,
     num_robots: int = 1,
+    repair_probability: float = 1.0,
     start: Callable[[RepairModel], StateGenerator] = CalibratedStart,
     partition: Partition | None = None,
     name: str | None = None,
@@ -52,12 +74,14 @@ def repair_problem(
 
     Args:
         graph: where the robots move.
-        chain: row-stochastic matrix ``[K, K]`` of the damage levels, see :func:`~torchrl_pomdp.envs.repair.damage_chain`.
-        costs: cost of a location per stage at each level, ``[K]``.
+        chain: row-stochastic matrix ``[K, K]`` of the damage levels, see :func:`~torchrl_pomdp.envs.repair.damage_chain`; or
+            ``[L, K, K]``, different by location.
+        costs: cost of a location per stage at each level, ``[K]`` or ``[L, K]``.
         discount: :math:`\alpha` in (0, 1).
 
     Keyword Args:
         num_robots: R.
+        repair_probability: that a repair works.
         start: what makes the start states from the model, such as
             :class:`~torchrl_pomdp.envs.repair.CalibratedStart`; of a user's own: a function that is given the model and
             returns a function from int64 keys ``[*B]`` to feature states ``[*B]``.
@@ -79,7 +103,16 @@ def repair_problem(
     device = check_device("device", device)
     if partition is None:
         partition = RepairPartition(check_instance("graph", graph, Graph), torch.as_tensor(costs), device=device)
-    model = RepairModel(graph, chain, costs, discount, num_robots=num_robots, partition=partition, device=device)
+    model = RepairModel(
+        graph,
+        chain,
+        costs,
+        discount,
+        num_robots=num_robots,
+        repair_probability=repair_probability,
+        partition=partition,
+        device=device,
+    )
     return Problem(
         model,
         start(model),
@@ -89,6 +122,7 @@ def repair_problem(
         pessimistic_cost=NeverRepairCost(model),
         symmetries=symmetries(model),
         encoder=RelativeEncoder,
+        agent_encoder=RobotEncoder,
     )
 
 
@@ -105,11 +139,58 @@ def _preset(
     num_robots: int = 1,
     start: Callable[[RepairModel], StateGenerator] = CalibratedStart,
     *,
+    repair_probability: float = 1.0,
     name: str,
     device: torch.device,
 ) -> Problem:
-    chain, costs = damage_chain(DEGRADATION), torch.tensor(COSTS)
-    return repair_problem(graph, chain, costs, DISCOUNT, num_robots=num_robots, start=start, name=name, device=device)
+    return repair_problem(
+        graph,
+        damage_chain(DEGRADATION),
+        torch.tensor(COSTS),
+        DISCOUNT,
+        num_robots=num_robots,
+        repair_probability=repair_probability,
+        start=start,
+        name=name,
+        device=device,
+    )
+
+
+def network32() -> Graph:
+    """The network of 32 locations of arXiv:2011.04222; the edge 2-3 is read off a picture and uncertain.
+
+    Examples:
+        >>> graph = network32()
+        >>> graph.num_locations, graph.location_names[0], len(graph.slot_names)
+        (32, '1', 4)
+    """
+    ends = [[int(end) - 1 for end in edge.split("-")] for edge in _NETWORK32.split()]
+    names = [str(location + 1) for location in range(32)]
+    columns, rows = zip(*_PLACES, strict=True)
+    return Graph.from_edges(
+        "network of 32", 32, [(first, second) for first, second in ends], columns=columns, rows=rows, location_names=names
+    )
+
+
+def _network32(num_robots: int, *, name: str, device: torch.device) -> Problem:
+    """The problems of arXiv:2011.04222: with many robots, repaired locations fail again.
+
+    Its start states are not published. Here every location is possibly damaged, and the robots are anywhere.
+    """
+    few = num_robots <= 4
+    problem = repair_problem(
+        network32(),
+        damage_chain(DEGRADATION if few else (0.01, *DEGRADATION[1:])),
+        torch.tensor(COSTS),
+        DISCOUNT if few else 0.95,
+        num_robots=num_robots,
+        start=partial(CalibratedStart, damaged_fraction=1.0),
+        partition=SinglePart(),
+        name=name,
+        device=device,
+    )
+    # What they add where a simulation is cut.
+    return replace(problem, pessimistic_cost=SteadyStateCost(problem.model))
 
 
 def _edges(edges: Any, *, locations: int | None = None, columns: Any = None, rows: Any = None) -> Graph:
@@ -122,10 +203,11 @@ def _edges(edges: Any, *, locations: int | None = None, columns: Any = None, row
     return Graph.from_edges("graph", size, pairs, columns=columns, rows=rows)
 
 
-def _grid(size: Any) -> Graph:
+def _grid(size: Any, *, obstacles: Any = ()) -> Graph:
     if not isinstance(size, (list, tuple)) or len(size) != 2:
         raise ValueError(f"grid must be [width, height], got {shown(size)}")
-    return grid(*size)
+    width, height = size
+    return grid(width, height, obstacles)
 
 
 GRAPHS: dict[str, Callable[..., Graph]] = {"line": line, "grid": _grid, "edges": _edges}
@@ -151,5 +233,8 @@ REPAIR_PRESETS: dict[str, Callable[..., Problem]] = {
     "grid5x4": partial(_preset, grid(5, 4)),
     "grid6x6": partial(_preset, grid(6, 6)),
     "two_robots20": partial(_preset, line(20), 2),
+    "grid6x6_obstacles": partial(_preset, grid(6, 6, _OBSTACLES)),
+    "linear20_slow_repair": partial(_preset, line(20), repair_probability=0.4),
+    **{f"network32x{robots}": partial(_network32, robots) for robots in (4, 8, 10)},
 }
-"""The paper's problems by name."""
+"""The paper's problems by name; those of its follow-up with a number of robots; and its extensions: obstacles, slow repairs."""

@@ -10,8 +10,11 @@ from torchrl_pomdp.checks import check_instance, check_seed
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules import (
+    AgentEncoder,
+    AgentNetwork,
     ClosedFormCost,
     Encoder,
+    FlatAgentEncoder,
     FlatEncoder,
     PartitionedPolicy,
     PartitionedValue,
@@ -20,7 +23,12 @@ from torchrl_pomdp.modules import (
 )
 from torchrl_pomdp.problems.problem import Problem
 
-__all__ = ["make_encoder", "make_networks", "make_values"]
+__all__ = ["is_multiagent", "make_agent_encoder", "make_encoder", "make_networks", "make_values"]
+
+
+def is_multiagent(problem: Problem, config: PolicyIterationConfig) -> bool:
+    """Whether agents share one policy network and decide in turn: as the configuration says, or where there are too many."""
+    return config.multiagent or not problem.model.enumerable
 
 
 def make_encoder(problem: Problem, config: PolicyIterationConfig) -> Encoder:
@@ -28,16 +36,25 @@ def make_encoder(problem: Problem, config: PolicyIterationConfig) -> Encoder:
     return problem.encoder(problem.model) if config.encoder == "own" else FlatEncoder(problem.model)
 
 
+def make_agent_encoder(problem: Problem, config: PolicyIterationConfig) -> AgentEncoder:
+    """The encoder of a network that many agents share: the problem's own, or the flat one."""
+    return problem.agent_encoder(problem.model) if config.encoder == "own" else FlatAgentEncoder(problem.model)
+
+
 def make_networks(
     problem: Problem, config: PolicyIterationConfig, seed: int, encoder: Encoder | None = None
 ) -> PartitionedPolicy:
     """An untrained partitioned policy: one policy network for each part of the problem's partition.
 
+    Many agents share an :class:`~torchrl_pomdp.modules.AgentNetwork`, where the configuration says so or there are too many
+    joint controls.
+
     Args:
         problem: the problem.
         config: sizes and encoding.
         seed: seed of the initial weights.
-        encoder: encoder that the networks share; by default a new one as the configuration says.
+        encoder: encoder that the networks share, for many agents an :class:`~torchrl_pomdp.modules.AgentEncoder`; by default a
+            new one as the configuration says.
 
     Raises:
         TypeError: if something is of the wrong kind.
@@ -48,9 +65,16 @@ def make_networks(
         >>> len(make_networks(make_problem("linear20"), PolicyIterationConfig(), seed=0).policies)
         6
     """
+    check_instance("problem", problem, Problem)
+    check_instance("config", config, PolicyIterationConfig)
+    parts, multiagent = range(problem.partition.num_parts), is_multiagent(problem, config)
+    if encoder is None:
+        encoder = make_agent_encoder(problem, config) if multiagent else make_encoder(problem, config)
     model, encoder = _checked(problem, config, seed, encoder)
     generator = torch.Generator(device=model.device).manual_seed(seed)
-    parts = range(problem.partition.num_parts)
+    if multiagent:
+        own = check_instance("encoder", encoder, AgentEncoder)
+        return PartitionedPolicy([AgentNetwork(own, config.hidden, generator=generator) for _ in parts])
     return PartitionedPolicy([PolicyNetwork(encoder, model.num_controls, config.hidden, generator=generator) for _ in parts])
 
 

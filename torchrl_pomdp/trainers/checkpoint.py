@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from os import PathLike
@@ -18,11 +18,17 @@ from torchrl_pomdp.checks import check_choice, check_instance, check_integer, ch
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, parse_tensors, tensor_bytes, write_bytes
 from torchrl_pomdp.identity import digest
-from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
+from torchrl_pomdp.modules import AgentNetwork, PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.problems.specs import problem_from_spec
 from torchrl_pomdp.tensor_checks import check_device
-from torchrl_pomdp.trainers.architecture import make_encoder, make_networks, make_values
+from torchrl_pomdp.trainers.architecture import (
+    is_multiagent,
+    make_agent_encoder,
+    make_encoder,
+    make_networks,
+    make_values,
+)
 
 __all__ = ["Checkpoint", "load_checkpoint", "open_run_folder", "problem_digest", "save_checkpoint"]
 
@@ -213,9 +219,10 @@ def _check_networks(policy: TensorDictModuleBase, problem: Problem) -> None:
             f"checkpoint.policy must be a PartitionedPolicy of networks, or one of {names} as it is by name, "
             f"got another {type(policy).__name__}"
         )
-    others = [type(local).__name__ for local in policy.policies if not isinstance(local, PolicyNetwork)]
+    kinds = (PolicyNetwork, AgentNetwork)
+    others = [type(local).__name__ for local in policy.policies if not isinstance(local, kinds)]
     if others:
-        raise ValueError(f"checkpoint.policy must have a PolicyNetwork in every part, got {others[0]}")
+        raise ValueError(f"checkpoint.policy must have a PolicyNetwork or an AgentNetwork in every part, got {others[0]}")
 
 
 def _content(checkpoint: Checkpoint) -> dict[str, Any]:
@@ -315,8 +322,14 @@ def _parse_base(base: Any, problem: Problem, content: dict[str, Any]) -> TensorD
 
 
 def _parse_policy(problem: Problem, config: PolicyIterationConfig, tensors: Any) -> PartitionedPolicy:
-    sizes = [make_encoder(problem, config).num_features, *config.hidden, problem.model.num_controls]
-    _check_tensors("policies", tensors, range(problem.partition.num_parts), sizes, problem.model.dtype)
+    model, parts = problem.model, range(problem.partition.num_parts)
+    if is_multiagent(problem, config):
+        encoder = make_agent_encoder(problem, config)
+        sizes = [encoder.num_features, *config.hidden, model.num_agent_controls]
+        more = {"marks": (encoder.num_marks, config.hidden[0])}
+    else:
+        sizes, more = [make_encoder(problem, config).num_features, *config.hidden, model.num_controls], {}
+    _check_tensors("policies", tensors, parts, sizes, model.dtype, more)
     policy = make_networks(problem, config, seed=0)
     policy.load_state_dict(tensors)
     return policy
@@ -336,11 +349,20 @@ def _parse_value(problem: Problem, config: PolicyIterationConfig, tensors: Any, 
 
 
 def _check_tensors(
-    name: str, tensors: dict[str, Tensor], parts: Sequence[int], sizes: Sequence[int], dtype: torch.dtype
+    name: str,
+    tensors: dict[str, Tensor],
+    parts: Sequence[int],
+    sizes: Sequence[int],
+    dtype: torch.dtype,
+    more: Mapping[str, tuple[int, ...]] | None = None,
 ) -> None:
-    """Raise unless the tensors are the finite weights of networks of these sizes, before any network is made."""
+    """Raise unless the tensors are the finite weights of networks of these sizes, before any network is made.
+
+    ``more``: shapes of further weights of each network.
+    """
     shapes: dict[str, tuple[int, ...]] = {}
     for part in parts:
+        shapes |= {f"{name}.{part}.{key}": shape for key, shape in (more or {}).items()}
         for layer, (fan_in, fan_out) in enumerate(pairwise(sizes)):
             shapes[f"{name}.{part}.network.{2 * layer}.weight"] = (fan_out, fan_in)
             shapes[f"{name}.{part}.network.{2 * layer}.bias"] = (fan_out,)

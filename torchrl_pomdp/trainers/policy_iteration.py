@@ -15,7 +15,7 @@ import math
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -34,7 +34,9 @@ from torchrl_pomdp.files import check_claimed, claim
 from torchrl_pomdp.identity import digest, identity
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import (
+    AgentNetwork,
     Encoder,
+    MultiagentRollout,
     PartitionedPolicy,
     PartitionedValue,
     Policy,
@@ -47,7 +49,13 @@ from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.objectives import ClassificationLoss, ValueLoss
 from torchrl_pomdp.problems.problem import Problem
-from torchrl_pomdp.trainers.architecture import make_encoder, make_networks, make_values
+from torchrl_pomdp.trainers.architecture import (
+    is_multiagent,
+    make_agent_encoder,
+    make_encoder,
+    make_networks,
+    make_values,
+)
 from torchrl_pomdp.trainers.logs import clear_log
 from torchrl_pomdp.trainers.parts import PartRecord, train_part
 from torchrl_pomdp.trainers.plan import Evaluate, Improve, Step, checked_plan
@@ -145,9 +153,23 @@ class PolicyIteration:
         self.progress = check_flag("progress", progress)
         self.on_labels = None if on_labels is None else check_callable("on_labels", on_labels)
         self._scale = problem.pessimistic_cost
-        self._symmetries = problem.symmetries[: None if config.symmetries else 1]
-        self._encoder = _shared_encoder(self.base_policy) or make_encoder(problem, config)
+        # Agents that decide in turn cannot change places.
+        keep_order = config.multiagent and problem.model.num_agents > 1
+        self._symmetries = problem.symmetries[: None if config.symmetries and not keep_order else 1]
+        self._multiagent = is_multiagent(problem, config)
         self._start()
+
+    @cached_property
+    def _encoder(self) -> Encoder:
+        """What the policy networks share."""
+        if self._multiagent:
+            return _shared_encoder(self.base_policy, AgentNetwork) or make_agent_encoder(self.problem, self.config)
+        return _shared_encoder(self.base_policy, PolicyNetwork) or make_encoder(self.problem, self.config)
+
+    @cached_property
+    def _value_encoder(self) -> Encoder:
+        """What the value networks share: the policy networks' where these see the state as they do."""
+        return make_encoder(self.problem, self.config) if self._multiagent else self._encoder
 
     def _start(self) -> None:
         self.best: TensorDictModuleBase = self.base_policy
@@ -212,13 +234,13 @@ class PolicyIteration:
         """The network to train: the one that the part has, or a new one."""
         step = self.plan[index]
         old = (local if isinstance(step, Improve) else values)[part]
-        if isinstance(old, LocalNetwork):
+        if isinstance(old, LocalNetwork) and isinstance(old, AgentNetwork) == (self._multiagent and isinstance(step, Improve)):
             # What has no weights is shared; a shared encoder lets networks be evaluated together.
             return copy.deepcopy(old, {id(old.encoder): old.encoder, id(self._scale): self._scale})
         seed = self._seed(number, "weights", part, index)
         if isinstance(step, Improve):
             return cast(LocalNetwork, make_networks(self.problem, self.config, seed, self._encoder).policies[part])
-        return cast(LocalNetwork, make_values(self.problem, self.config, seed, self._encoder, self._scale).values[part])
+        return cast(LocalNetwork, make_values(self.problem, self.config, seed, self._value_encoder, self._scale).values[part])
 
     def _restore(self, networks: dict[int, LocalNetwork], name: str) -> dict[str, PartRecord] | None:
         """Load the networks of a step where an interrupted run has trained them; None where it has not."""
@@ -318,7 +340,8 @@ class PolicyIteration:
         if isinstance(step, Evaluate):
             return PolicyEvaluation(env, policy, label=partial(PolicyCost, **simulation), **options)
         simulation |= {"trajectories": config.trajectories, "leaves": config.leaves, "allocation": config.allocation}
-        return RolloutImprovement(env, policy, label=partial(RolloutPolicy, **simulation), **options)
+        rollout = MultiagentRollout if self._multiagent else RolloutPolicy
+        return RolloutImprovement(env, policy, label=partial(rollout, **simulation), **options)
 
     def _visit(self, policy: TensorDictModuleBase, number: int) -> None:
         """Remember states that an iteration's policy visits, also a rejected one's: there the next one can do better."""
@@ -360,7 +383,7 @@ def _judge(comparison: Comparison) -> tuple[bool, str]:
     )
 
 
-def _shared_encoder(policy: TensorDictModuleBase) -> Encoder | None:
-    """The encoder of a policy's networks, if it has any."""
+def _shared_encoder(policy: TensorDictModuleBase, kind: type[LocalNetwork]) -> Encoder | None:
+    """The encoder of a policy's networks of a kind, if it has any."""
     local = policy.policies if isinstance(policy, PartitionedPolicy) else [policy]
-    return next((p.encoder for p in local if isinstance(p, PolicyNetwork)), None)
+    return next((p.encoder for p in local if isinstance(p, kind)), None)

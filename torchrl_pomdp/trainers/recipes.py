@@ -143,13 +143,24 @@ def _cut_stages(problem: Problem, algorithm: str) -> list[tuple[tuple[int, ...],
     return [(stage, OnEntering(parts) if parts else None) for stage, parts in zip(stages, earlier, strict=True)]
 
 
-def api(problem: Problem, config: PolicyIterationConfig, base_policy: Policy, **options: Any) -> PolicyIteration:
+def api(
+    problem: Problem,
+    config: PolicyIterationConfig,
+    base_policy: Policy,
+    *,
+    truncation: Truncation | None = None,
+    **options: Any,
+) -> PolicyIteration:
     """Policy iteration with one network for the whole feature space; the problem must have a single part.
 
     Args:
         problem: the problem, such as :meth:`Problem.unpartitioned` of another.
         config: the numbers; ``samples_per_part`` is then the number of all samples.
         base_policy: the policy that is improved first.
+
+    Keyword Args:
+        truncation: rule that cuts the simulations, such as :class:`~torchrl_pomdp.modules.AfterSteps`; what is added is the
+            problem's pessimistic cost. None: no truncation.
         options: see :class:`PolicyIteration`.
 
     Raises:
@@ -165,4 +176,4 @@ def api(problem: Problem, config: PolicyIterationConfig, base_policy: Policy, **
     parts = check_instance("problem", problem, Problem).partition.num_parts
     if parts != 1:
         raise ValueError(f"API is for a problem with a single part, {problem.name!r} has {parts}: take problem.unpartitioned()")
-    return PolicyIteration(problem, config, base_policy, [Improve((0,))], **options)
+    return PolicyIteration(problem, config, base_policy, [Improve((0,), truncation)], **options)

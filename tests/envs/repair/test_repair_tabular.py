@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from _oracles import brute_force, random_states, small_model
+from _oracles import brute_force, random_states, small_model, varied_model
 from tensordict import TensorDict
 
 from torchrl_pomdp.envs.repair import Graph, UniformStart, damage_chain, grid, line
@@ -20,12 +20,22 @@ GRAPHS = {
     "nowhere to go": {"graph": line(1)},
     "two robots, nowhere to go": {"graph": line(1), "num_robots": 2},
     "three robots": {"graph": line(2), "num_robots": 3, "degradation": (0.1,), "costs": (0.0, 1.0)},
+    "repairs that fail": {"graph": line(3), "repair_probability": 0.75},
+}
+
+# Locations with chains and costs of their own.
+VARIED = {
+    "own chains and costs": {"graph": line(3), "repair_probability": 1.0},
+    "own chains and costs, repairs that fail": {"graph": line(3)},
+    "own chains and costs, two robots": {"graph": line(2), "num_robots": 2},
+    "own chains and costs, grid": {"graph": grid(2, 2), "seed": 1},
 }
 
 
-@pytest.fixture(params=GRAPHS, ids=GRAPHS)
+@pytest.fixture(params=[*GRAPHS, *VARIED])
 def model(request):
-    return small_model(**GRAPHS[request.param])
+    name = request.param
+    return small_model(**GRAPHS[name]) if name in GRAPHS else varied_model(**VARIED[name])
 
 
 def looked(model, y):
@@ -72,9 +82,10 @@ def test_the_same_law_before_the_robots_have_looked(model):
     assert_same_law(model, table, after[:12], start_observed=False)
 
 
-def test_the_same_law_by_counting_all_joint_states():
+@pytest.mark.parametrize("make", [small_model, varied_model])
+def test_the_same_law_by_counting_all_joint_states(make):
     """The oracle of the repair model's own tests, which is written from the problem's statement."""
-    model = small_model(line(3), num_robots=2)
+    model = make(line(3), num_robots=2)
     table, y = tabular_model(model), looked(model, random_states(model, 4, seed=5))
     there = as_table(model, y)
     for row, u in zip(*pairs(model.action_mask(y)), strict=True):

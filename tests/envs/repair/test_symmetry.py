@@ -10,7 +10,7 @@ import pytest
 import torch
 from _oracles import random_states, small_model
 
-from torchrl_pomdp.envs.repair import Graph, RepairPartition, grid, line, symmetries
+from torchrl_pomdp.envs.repair import Graph, RepairModel, RepairPartition, damage_chain, grid, line, symmetries
 from torchrl_pomdp.modules import RolloutPolicy
 from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
 
@@ -31,7 +31,7 @@ def test_the_model_does_not_see_the_difference(graph, robots, count):
             rows = y["action_mask"][:, u].nonzero().squeeze(-1)
             control = torch.full((len(rows),), u)
             probs = model.observation_probs(y[rows], control)
-            renamed = symmetry.controls[control]
+            renamed = symmetry.joint_controls[control]
             # The joint observation's digits are the robots' levels.
             levels = torch.arange(model.num_observations)
             digits = torch.stack([levels // model.num_levels ** (robots - 1 - r) % model.num_levels for r in range(robots)], -1)
@@ -49,6 +49,19 @@ def test_no_two_are_the_same_and_the_identity_comes_first():
     assert found[0].locations.tolist() == [0, 1, 2, 3]
     assert found[0].controls.tolist() == [0, 1, 2, 3, 4]
     assert len({tuple(s.locations.tolist()) for s in found}) == 8
+
+
+@pytest.mark.parametrize("table", ["chain", "costs", "both"])
+def test_chains_and_costs_of_locations_are_kept(table):
+    """A line whose tables are those of its mirror image has a reflection; one of whose locations differs has none."""
+    chains = torch.stack([damage_chain(rise) for rise in ((0.0, 0.3), (0.1, 0.2))])
+    costs = torch.tensor([[0.0, 1.0, 5.0], [0.5, 2.0, 3.0]])
+    for ends, count in (((0, 1, 1, 0), 2), ((0, 1, 0, 1), 1), ((0, 0, 0, 1), 1), ((0, 0, 0, 0), 2)):
+        own = torch.tensor(ends)
+        chain = chains[0] if table == "costs" else chains[own]
+        price = costs[0] if table == "chain" else costs[own]
+        found = symmetries(RepairModel(line(4), chain, price, 0.9))
+        assert [s.locations.tolist() for s in found] == [[0, 1, 2, 3], [3, 2, 1, 0]][:count]
 
 
 def test_graphs_without_a_plan_have_only_what_their_edges_allow():
@@ -125,4 +138,4 @@ def test_images_of_labels_are_labels_of_images():
     ties = (labelled["q_factors"] - again["q_factors"]).nan_to_num(0.0).abs()
     # Greedy itself breaks ties to the left, so that its own cost is not quite symmetric.
     assert float(ties.mean() / again["q_factors"][torch.isfinite(again["q_factors"])].mean()) < 0.05
-    assert (labelled["action"] == mirror.controls[policy(y)["action"]]).all()
+    assert (labelled["action"] == mirror.joint_controls[policy(y)["action"]]).all()

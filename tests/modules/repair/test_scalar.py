@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 import pickle
+import tracemalloc
 
 import networkx as nx
 import numpy as np
 import pytest
 import torch
-from _oracles import Memo, line3_cost
+from _oracles import Memo, line3_cost, random_states, varied_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
@@ -36,6 +37,7 @@ from torchrl_pomdp.modules import (
 )
 from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, SteadyStateCost, UrgencyRepair
 from torchrl_pomdp.modules.repair.scalar import expected_cost, repair_engine
+from torchrl_pomdp.modules.scalar import Allocation
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.scalar import scalar_twin
 
@@ -102,19 +104,48 @@ RULES = {
 }
 
 
+@st.composite
+def varied_models(draw):
+    """Random graphs whose locations have chains and costs of their own, with 1 to 3 robots whose repairs may fail."""
+    size, robots, seed = draw(st.integers(2, 6)), draw(st.integers(1, 3)), draw(st.integers(0, 10_000))
+    graph = Graph.from_edges("tree", size, list(nx.random_labeled_tree(size, seed=seed).edges))
+    dtype, works = draw(st.sampled_from([torch.float32, torch.float64])), draw(st.sampled_from([0.4, 1.0]))
+    model = varied_model(graph, robots, seed=seed, repair_probability=works, dtype=dtype)
+    if draw(st.booleans()):
+        # Level 0 lasts, is free and is reached by repair alone, in places.
+        chain, costs = model.chain.double().clone(), model.costs.clone()
+        kept = slice(None) if draw(st.booleans()) else slice(1)
+        chain[kept, 0], costs[kept, 0] = torch.eye(3, dtype=torch.float64)[0], 0.0
+        chain[kept, 1:, 0] = 0.0
+        options = {"num_robots": robots, "repair_probability": works, "dtype": dtype}
+        model = RepairModel(graph, chain / chain.sum(-1, keepdim=True), costs, 0.9, **options)
+    return model.with_partition(RepairPartition(graph, model.costs))
+
+
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(models(), st.sampled_from(sorted(RULES)), st.sampled_from([GreedyRepair, UrgencyRepair]), st.integers(0, 1000))
 def test_trajectories_and_q_factors_are_those_of_the_tensors(model, rule, kind, seed):
-    base, y, options = kind(model), some_states(model, seed), RULES[rule](model)
     # Where beliefs have mixed, locations at one distance are equally urgent but for rounding.
     share = 0.1 if kind is UrgencyRepair and not bool((model.chain.tril(-1) == 0).all()) else 0.001
-    keys = seed_keys(seed, torch.arange(40))
+    means_the_same(model, kind(model), some_states(model, seed), RULES[rule](model), seed, share)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(varied_models(), st.sampled_from(sorted(RULES)), st.sampled_from([GreedyRepair, UrgencyRepair]), st.integers(0, 1000))
+def test_locations_of_their_own_and_repairs_that_fail(model, rule, kind, seed):
+    means_the_same(model, kind(model), random_states(model, 400, seed), RULES[rule](model), seed)
+
+
+def means_the_same(model, base, y, options, seed, share=0.001):
+    """Trajectories and Q-factors by both kinds of leaves, compiled and by tensors."""
+    keys = seed_keys(seed, torch.arange(len(y)))
 
     def trajectories():
         return TruncatedRollout(model, base, **options)
 
     assert trajectories().scalar is not None
     assert_close(trajectories()(y, keys), without(trajectories)(y, keys), share)
+    y = y[:40]
     for leaves, count in (("control", 4), ("observation", 1)):
 
         def policy(leaves=leaves, count=count):
@@ -123,6 +154,84 @@ def test_trajectories_and_q_factors_are_those_of_the_tensors(model, rule, kind, 
         compiled, tensors = policy(), without(policy)
         assert_close(compiled.q_factors(y), tensors.q_factors(y), share)
         assert abs(compiled.simulated_steps / tensors.simulated_steps - 1) < 0.01
+
+
+# ---- given candidates ------------------------------------------------------------------------------------------------
+
+
+def candidates_of(model, count, each, seed):
+    """Random controls of robots ``[N, C, R]``, also of what is no control, and their numbers; -1 where there is none."""
+    generator, base = np.random.default_rng(seed), model.num_robot_controls
+    controls = generator.integers(-1, base + 1, (count, each, model.num_robots))
+    # The first one moves or stays, so that it is a control.
+    controls[:, 0] = generator.integers(0, base, (count, model.num_robots))
+    numbers = (controls * base ** np.arange(model.num_robots - 1, -1, -1)).sum(-1)
+    return controls, torch.from_numpy(np.where(((controls >= 0) & (controls < base)).all(-1), numbers, -1))
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(st.one_of(models(), varied_models()), st.sampled_from(["control", "observation"]), st.integers(0, 1000))
+def test_given_candidates_have_the_q_factors_of_all_controls(model, leaves, seed):
+    y = some_states(model, seed, 15) if model.dtype == torch.float32 else random_states(model, 15, seed)
+
+    def policy():
+        return RolloutPolicy(model, GreedyRepair(model), trajectories=2, leaves=leaves, seed=seed)
+
+    compiled = policy()
+    engine, allocation = compiled.cost_to_go.engine(), compiled._allocation(None)
+    controls, numbers = candidates_of(model, 15, 7, seed)
+    q, steps = engine.q_factors(y, None, seed, allocation, controls)
+    whole, _ = engine.q_factors(y, None, seed, allocation)
+    found = torch.from_numpy(whole).gather(1, numbers.clamp_min(0)).masked_fill(numbers < 0, torch.inf)
+    assert torch.equal(torch.from_numpy(q), found), "to the last bit, whichever others there are"
+    assert_close(
+        torch.from_numpy(q).to(model.dtype)[numbers >= 0],
+        without(policy).q_factors(y).gather(1, numbers.clamp_min(0))[numbers >= 0],
+    )
+    # Those of one state alone, in another order, and of other blocks.
+    alone, fewer = engine.q_factors(y[3:4], None, seed, allocation, controls[3:4, ::-1])
+    assert np.array_equal(alone[:, ::-1], q[3:4])
+    assert fewer <= steps
+
+
+def test_candidates_are_checked(linear20):
+    model, y = linear20.model, linear20.start(torch.arange(3))
+    policy = RolloutPolicy(model, GreedyRepair(model))
+    engine, allocation = policy.cost_to_go.engine(), policy._allocation(None)
+    for wrong in (
+        np.zeros((2, 1, 1), np.int64),
+        np.zeros((3, 1, 2), np.int64),
+        np.zeros((3, 0, 1), np.int64),
+        np.zeros((3, 1), np.int64),
+        np.zeros((3, 1, 1), np.int32),
+    ):
+        with pytest.raises(ValueError, match=r"controls must be int64 of shape \(3, C, 1\) with C at least 1, got int"):
+            engine.q_factors(y, None, 0, allocation, wrong)
+
+
+def test_nothing_is_as_large_as_the_number_of_joint_controls():
+    """Ten robots with five controls each have ten million joint controls."""
+    model = RepairModel(grid(4, 4), damage_chain((0.0, 0.1, 0.2)), (0, 1, 5, 20), 0.9, num_robots=10, repair_probability=0.8)
+    y, keys, base = CalibratedStart(model)(torch.arange(6)), torch.arange(6), UrgencyRepair(model)
+    controls = model.split_controls(base(y.clone())["action"]).unsqueeze(1).repeat(1, 3, 1).numpy()
+    # The first robot may do something else, too.
+    controls[:, 1:, 0] = 0, 1
+
+    def costs():
+        return TruncatedRollout(model, base)
+
+    compiled = costs()
+    engine, allocation = compiled.engine(), Allocation(np.arange(4), np.array([4]), False, np.inf, None)
+    for _ in range(2):
+        # What is compiled in the first turn is not counted.
+        tracemalloc.start()
+        found = compiled(y, keys), engine.q_factors(y, None, 0, allocation, controls)[0]
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert most < 1 << 20
+    assert_close(found[0], without(costs)(y, keys))
+    legal = model.agent_mask(y).gather(-1, torch.from_numpy(controls).movedim(1, -1)).all(1)
+    assert np.array_equal(np.isfinite(found[1]), legal.numpy())
 
 
 @pytest.mark.parametrize("kind", [GreedyRepair, UrgencyRepair])
@@ -459,8 +568,6 @@ def test_seconds_must_be_positive(linear20):
 
 
 def test_as_many_trajectories_as_the_time_allows():
-    from torchrl_pomdp.modules.scalar import Allocation
-
     allocation = Allocation(np.arange(100), np.full(25, 4), False, np.inf, 1e-12)
     assert [rounds.tolist() for rounds in allocation.stretches()] == [[4]]
     plenty = list(allocation._replace(seconds=1e6).stretches())

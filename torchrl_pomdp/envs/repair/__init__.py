@@ -5,7 +5,7 @@ from torchrl_pomdp.envs.repair.generators import CalibratedStart, RandomState, U
 from torchrl_pomdp.envs.repair.graphs import Graph, grid, line
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
-from torchrl_pomdp.envs.repair.rendering import trajectory_figure
+from torchrl_pomdp.envs.repair.rendering import network_figure, save_animation, trajectory_figure
 from torchrl_pomdp.envs.repair.symmetry import Symmetry, symmetries
 from torchrl_pomdp.envs.repair.tabular import joint_belief, tabular_model
 
@@ -22,6 +22,8 @@ __all__ = [
     "grid",
     "joint_belief",
     "line",
+    "network_figure",
+    "save_animation",
     "symmetries",
     "tabular_model",
     "trajectory_figure",

@@ -186,6 +186,30 @@ class Graph:
             location_names=[str(node) for node in nodes],
         )
 
+    def without_edge(self, first: int, second: int) -> Graph:
+        """The same graph with a blocked edge: locations, slots and places stay, so that an old policy still fits.
+
+        Args:
+            first: one end.
+            second: the other end.
+
+        Raises:
+            TypeError: if an end is no integer.
+            ValueError: if there is no such edge, or a location can no longer be reached.
+
+        Examples:
+            >>> grid(2, 2).without_edge(0, 1).neighbours.tolist()
+            [[-1, -1, -1, 2], [-1, -1, -1, 3], [-1, 3, 0, -1], [2, -1, 1, -1]]
+        """
+        ends = [check_integer(name, end, 0, self.num_locations - 1) for name, end in (("first", first), ("second", second))]
+        if ends[1] not in self.neighbours[ends[0]].tolist():
+            raise ValueError(f"first and second must be the ends of an edge, got {first} and {second}")
+        table = self.neighbours.clone()
+        for one, other in (ends, ends[::-1]):
+            table[one, table[one] == other] = -1
+        name = f"{self.name} without {self.location_names[ends[0]]}-{self.location_names[ends[1]]}"
+        return Graph(name, table, self.slot_names, self.columns, self.rows, self.location_names)
+
     @property
     def num_locations(self) -> int:
         """L, the number of nodes."""
@@ -216,33 +240,59 @@ def line(num_locations: int) -> Graph:
     return Graph.from_slots(f"line of {num_locations}", table, ("left", "right"), range(num_locations), [0] * num_locations)
 
 
-def grid(width: int, height: int) -> Graph:
+def grid(width: int, height: int, obstacles: Iterable[Sequence[int]] = ()) -> Graph:
     """A rectangular grid, numbered row by row; controls are repair, left, right, up, down.
 
     Args:
         width: number of columns, at least 1.
         height: number of rows, at least 1; there are at most 1024 locations.
+        obstacles: cells ``(column, row)`` that are no locations; the others are numbered without them, and remain connected.
 
     Raises:
-        TypeError: if a size is no integer.
-        ValueError: if a size is not positive or there are too many locations.
+        TypeError: if a size is no integer, or an obstacle no pair of integers.
+        ValueError: if a size is not positive, there are too many locations, an obstacle is no cell or is given twice, or the
+            obstacles leave no location or tear the grid apart.
 
     Examples:
         >>> grid(3, 2).neighbours[4].tolist()
         [3, 5, 1, -1]
+        >>> grid(3, 2, obstacles=[(1, 0)]).neighbours.tolist()
+        [[-1, -1, -1, 2], [-1, -1, -1, 4], [-1, 3, 0, -1], [2, 4, -1, -1], [3, -1, 1, -1]]
     """
     check_integer("width", width, 1, MAX_LOCATIONS)
     check_integer("height", height, 1, MAX_LOCATIONS)
     if width * height > MAX_LOCATIONS:
         raise ValueError(f"width times height must be at most {MAX_LOCATIONS} locations, got {width} x {height}")
-    places = [(column, row) for row in range(height) for column in range(width)]
-
-    def at(column: int, row: int) -> int:
-        return row * width + column if 0 <= column < width and 0 <= row < height else -1
-
-    table = [[at(c - 1, r), at(c + 1, r), at(c, r - 1), at(c, r + 1)] for c, r in places]
+    blocked = _cells(obstacles, width, height)
+    places = [(column, row) for row in range(height) for column in range(width) if (column, row) not in blocked]
+    if not places:
+        raise ValueError("obstacles must leave a location, got one on every cell")
+    number = {place: location for location, place in enumerate(places)}
+    table = [[number.get(to, -1) for to in ((c - 1, r), (c + 1, r), (c, r - 1), (c, r + 1))] for c, r in places]
     columns, rows = zip(*places, strict=True)
-    return Graph.from_slots(f"{width} x {height} grid", table, ("left", "right", "up", "down"), columns, rows)
+    name = f"{width} x {height} grid" + (f" with {len(blocked)} obstacles" if blocked else "")
+    try:
+        return Graph.from_slots(name, table, ("left", "right", "up", "down"), columns, rows)
+    except ValueError as error:
+        if not blocked:
+            raise
+        raise ValueError(f"obstacles must leave the grid connected: {error}") from error
+
+
+def _cells(obstacles: Any, width: int, height: int) -> set[tuple[int, int]]:
+    """Different cells of a grid."""
+    if not isinstance(obstacles, Iterable) or isinstance(obstacles, (str, bytes)):
+        raise TypeError(f"obstacles must hold cells (column, row), got {shown(obstacles)}")
+    cells: set[tuple[int, int]] = set()
+    for i, cell in enumerate(obstacles):
+        pair = _sequence(f"obstacles[{i}]", cell)
+        if len(pair) != 2:
+            raise ValueError(f"obstacles[{i}] must be a cell (column, row), got {shown(cell)}")
+        column, row = (check_integer(f"obstacles[{i}]", each) for each in pair)
+        if not (0 <= column < width and 0 <= row < height) or (column, row) in cells:
+            raise ValueError(f"obstacles must hold different cells of the {width} x {height} grid, got {(column, row)}")
+        cells.add((column, row))
+    return cells
 
 
 def _sequence(name: str, value: Any) -> Sequence[Any]:

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
+from torchrl_pomdp.envs.controls import MAX_ENUMERATED
 from torchrl_pomdp.envs.digits import digits
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.repair.chains import (
@@ -45,15 +46,16 @@ __all__ = ["REPAIR", "RepairModel"]
 REPAIR = 0
 """A robot's control *repair*; control ``1 + s`` moves along slot ``s`` of the graph."""
 
-# Largest numbers of joint controls, which masks hold, and of joint observations, which are numbered.
-_MAX_CONTROLS, _MAX_OBSERVATIONS = 1 << 16, 1 << 31
+# Joint observations are numbered.
+_MAX_OBSERVATIONS = 1 << 62
 
 
 class RepairModel(Robots):
     r"""Belief model of the repair problem: L locations with K damage levels, R robots.
 
-    Core entries: ``"belief"`` float ``[*B, L, K]`` and ``"location"`` int64 ``[*B, R]``. The joint control is the number
-    whose base-A digits are the robots' controls, robot 0 first; the joint observation has base-K digits likewise.
+    Core entries: ``"belief"`` float ``[*B, L, K]`` and ``"location"`` int64 ``[*B, R]``. The robots are agents, see
+    :mod:`~torchrl_pomdp.envs.controls` for their joint controls; the joint observation is the number whose base-K digits are
+    the levels that the robots see, robot 0 first.
 
     A robot may not leave the graph; it may repair a location known to be at level 0 only where no move is possible. States
     with P(any damage) <= ``terminal_probability`` are terminal if level 0 is absorbing.
@@ -69,7 +71,7 @@ class RepairModel(Robots):
         discount: :math:`\alpha`.
 
     Keyword Args:
-        num_robots: R, at least 1; at most 65536 joint controls.
+        num_robots: R, 1 to 16.
         repair_probability: :math:`\rho`, that a repair works, in (0, 1].
         terminal_probability: :math:`\epsilon`, in [0, 1).
         partition: partition whose index becomes a feature.
@@ -118,11 +120,13 @@ class RepairModel(Robots):
         self.repair_probability = check_number("repair_probability", repair_probability, "(0, 1]")
         self.num_robots = check_integer("num_robots", num_robots, 1, 16)
         self.num_robot_controls = len(graph.control_names)
+        self.num_agents = self.num_robots
         self.num_controls = self.num_robot_controls**self.num_robots
         self.num_observations = self.num_levels**self.num_robots
-        if self.num_controls > _MAX_CONTROLS or self.num_observations > _MAX_OBSERVATIONS:
+        if self.num_observations > _MAX_OBSERVATIONS:
             raise ValueError(
-                f"num_robots must leave at most {_MAX_CONTROLS} joint controls, got {num_robots} with {self.num_controls}"
+                f"num_robots must leave at most {_MAX_OBSERVATIONS} joint observations, got {num_robots} robots with "
+                f"{self.num_observations}"
             )
         self.noise_dim = self.num_robots
         self.terminal_probability = check_number("terminal_probability", terminal_probability, "[0, 1)")
@@ -205,14 +209,21 @@ class RepairModel(Robots):
     # ---- controls ------------------------------------------------------------------------------------------------
 
     def action_mask(self, y: TensorDictBase) -> Tensor:
-        """Legal joint controls, bool ``[*B, U]``: every robot's control is legal for it."""
-        belief, location = y.get("belief"), y.get("location")
-        robots = self._legal_when_intact.index_select(0, location.flatten()).unflatten(0, location.shape)
-        robots[..., REPAIR] |= belief[..., 0].gather(-1, location) < 1.0
+        """Legal joint controls, see :mod:`~torchrl_pomdp.envs.controls`: every robot's control is legal for it."""
+        robots = self.agent_mask(y)
+        if not self.enumerable:
+            return robots
         mask = robots[..., 0, :]
         for robot in range(1, self.num_robots):
             mask = (mask.unsqueeze(-1) & robots[..., robot, :].unsqueeze(-2)).flatten(-2)
         return mask
+
+    def agent_mask(self, y: TensorDictBase) -> Tensor:
+        """Legal controls of every robot, bool ``[*B, R, A]``."""
+        belief, location = y.get("belief"), y.get("location")
+        robots = self._legal_when_intact.index_select(0, location.flatten()).unflatten(0, location.shape)
+        robots[..., REPAIR] |= belief[..., 0].gather(-1, location) < 1.0
+        return robots
 
     def legal_when_intact(self) -> Tensor:
         """Controls that a robot may take where its location is known to be intact, bool ``[L, A]``."""
@@ -246,7 +257,16 @@ class RepairModel(Robots):
         return (1.0 - intact <= self.terminal_probability).view(y.batch_size)
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
-        """Joint distribution of the robots' observed levels, ``[*B, K^R]``."""
+        """Joint distribution of the robots' observed levels, ``[*B, K^R]``.
+
+        Raises:
+            ValueError: if there are more than 4096 joint observations of several robots, too many for tables.
+        """
+        if self.num_robots > 1 and self.num_observations > MAX_ENUMERATED:
+            raise ValueError(
+                f"num_observations must be at most {MAX_ENUMERATED} for their probabilities, got {self.num_levels}^"
+                f"{self.num_robots} = {self.num_observations}: draw them by advance(), in rollout with leaves='control'"
+            )
         location, repaired = self._move(y, u)
         columns = self._columns(self._planes(y), location, repaired)
         every = digits(torch.arange(self.num_observations, device=self.device), self.num_levels, self.num_robots)
@@ -319,7 +339,7 @@ class RepairModel(Robots):
     def _move(self, y: TensorDictBase, u: Tensor) -> tuple[Tensor, Tensor]:
         """For each robot ``[R, N]`` its new location and whether it repairs there."""
         origin = y.get("location").reshape(-1, self.num_robots).T
-        controls = digits(u.reshape(-1), self.num_robot_controls, self.num_robots).T
+        controls = self.split_controls(u).reshape(-1, self.num_robots).T
         return self.destinations.flatten()[origin * self.num_robot_controls + controls], controls == REPAIR
 
     def _columns(self, planes: Tensor, location: Tensor, repaired: Tensor) -> list[Tensor]:

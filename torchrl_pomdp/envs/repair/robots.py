@@ -13,7 +13,6 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_integer, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.envs.digits import digits, joined
 from torchrl_pomdp.envs.names import number_of
 from torchrl_pomdp.envs.repair.graphs import Graph
 
@@ -23,7 +22,7 @@ __all__ = ["Robots"]
 class Robots(BeliefModel):
     """The robots of a :class:`~torchrl_pomdp.envs.repair.RepairModel`: their controls, and observations that may be missing.
 
-    The joint control is the number whose base-A digits are the robots' controls, robot 0 first. An observation is the damage
+    Robots are agents, see :mod:`~torchrl_pomdp.envs.controls` for joint controls. An observation is the damage
     level that a robot sees where it stands: one for each robot, or None from a robot that does not report; a single robot's
     may stand alone.
 
@@ -39,33 +38,30 @@ class Robots(BeliefModel):
     num_robot_controls: int
     num_levels: int
 
-    def split_controls(self, u: Tensor) -> Tensor:
-        """Robots' controls ``[*B, R]`` of joint controls ``[*B]``."""
-        return digits(u, self.num_robot_controls, self.num_robots)
-
-    def join_controls(self, controls: Tensor) -> Tensor:
-        """Joint controls ``[*B]`` of robots' controls ``[*B, R]``."""
-        return joined(controls, self.num_robot_controls)
+    @property
+    def num_agent_controls(self) -> int:
+        """A: robots are the model's agents, see :mod:`~torchrl_pomdp.envs.controls`."""
+        return self.num_robot_controls
 
     # ---- what real robots do and report --------------------------------------------------------------------------------
 
-    def shown_control(self, u: int) -> tuple[str, ...]:
+    def shown_control(self, u: Tensor) -> tuple[str, ...]:
         """Names of the robots' controls, such as ``("repair", "left")``."""
-        return tuple(self.graph.control_names[c] for c in self.split_controls(torch.tensor(u)).tolist())
+        return tuple(self.graph.control_names[c] for c in self.split_controls(u).tolist())
 
-    def control_number(self, control: Any) -> int:
+    def given_control(self, control: Any) -> Tensor:
         """The joint control that is given by its number, or by a number or name for each robot; of one robot without a list.
 
         Raises:
             TypeError: if it is of another kind.
             ValueError: if there is no such control, or not one for each robot.
         """
-        if isinstance(control, Integral):
-            return check_integer("control", control, 0, self.num_controls - 1)
+        if isinstance(control, Integral) and self.enumerable:
+            return torch.tensor(check_integer("control", control, 0, self.num_controls - 1), device=self.device)
         each = self._each("control", control)
         names, count = self.graph.control_names, self.num_robot_controls
         numbers = [number_of(f"control of robot {robot}", given, names, count) for robot, given in enumerate(each)]
-        return int(self.join_controls(torch.tensor(numbers)))
+        return self.join_controls(torch.tensor(numbers, device=self.device))
 
     def condition(self, y: TensorDictBase, observation: Any) -> TensorDictBase:
         """The state ``y``, of batch ``()``, after the robots have looked where they stand, without a control.

@@ -9,7 +9,7 @@ as much over all states, if it breaks ties by number, as greedy does, or is a ne
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice, permutations, product
 
 import torch
@@ -34,40 +34,58 @@ class Symmetry:
     Attributes:
         model: the repair model.
         locations: int64 ``[L]``; the new name of every location.
-        controls: int64 ``[U]``; the new name of every joint control.
+        controls: int64 ``[A]``; the new name of every control of a robot.
         robots: int64 ``[R]``; which robot takes the place of the first, the second, ...
+        joint_controls: int64 ``[U]``; the new name of every joint control; ``[0]`` where these are no numbers.
     """
 
     model: RepairModel
     locations: Tensor
     controls: Tensor
     robots: Tensor
+    joint_controls: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        model = self.model
+        every = torch.arange(model.num_controls if model.enumerable else 0, device=model.device)
+        if len(every):
+            every = model.join_controls(self.controls[model.split_controls(every)[:, self.robots]])
+        object.__setattr__(self, "joint_controls", every)
 
     def __call__(self, y: TensorDictBase) -> TensorDictBase:
         """The images of feature states and labels ``[*B]``; entries that it does not know are the same for the image.
 
         Args:
-            y: ``belief`` and ``location``, and any of ``action_mask``, ``partition``, ``action`` and ``q_factors``.
+            y: ``belief`` and ``location``, and any of ``action_mask``, ``partition``, ``action`` and ``q_factors``, the last
+                by joint controls or by robots.
         """
         image, keys = check_entries("y", y, ("belief", "location")).copy(), set(y.keys())
         back = self.locations.argsort()
         image.set("belief", y.get("belief").index_select(-2, back))
         image.set("location", self.locations[y.get("location").index_select(-1, self.robots)])
         if "action" in keys:
-            image.set("action", self.controls[y.get("action")])
+            u = y.get("action")
+            image.set("action", self.joint_controls[u] if self.model.enumerable else self.controls[u[..., self.robots]])
         for key in ("action_mask", "q_factors"):
             if key in keys:
-                image.set(key, y.get(key).index_select(-1, self.controls.argsort()))
+                image.set(key, self._by_control(y.get(key), y.ndim))
         if self.model.partition is not None and "partition" in keys:
             image.set("partition", self.model.partition(image))
         return image
+
+    def _by_control(self, values: Tensor, batch_dims: int) -> Tensor:
+        """Images of numbers of joint controls ``[*B, U]``, or of robots' controls ``[*B, R, A]``."""
+        if values.ndim == batch_dims + 1:
+            return values.index_select(-1, self.joint_controls.argsort())
+        return values.index_select(-2, self.robots).index_select(-1, self.controls.argsort())
 
 
 def symmetries(model: RepairModel) -> list[Symmetry]:
     """Symmetries of a repair model that its graph's columns and rows show, the identity first.
 
     These are all reflections and rotations of the plan by right angles that keep the graph, and the chains and costs of its
-    locations, with all exchanges of the robots; of more than five robots the last five are exchanged.
+    locations, with all exchanges of the robots; of more than five robots the last five are exchanged. Where there are too many
+    joint controls to be numbered, robots decide one after the other, and their order stays.
 
     Args:
         model: the repair model.
@@ -86,11 +104,10 @@ def symmetries(model: RepairModel) -> list[Symmetry]:
         if not _keeps(locations, model):
             continue
         controls = torch.tensor([0, *(1 + slot for slot in slots)])
-        for order in islice(permutations(range(model.num_robots)), _MOST_ORDERS):
+        orders = islice(permutations(range(model.num_robots)), _MOST_ORDERS) if model.enumerable else [range(model.num_robots)]
+        for order in orders:
             robots = torch.tensor(order, device=model.device)
-            every = model.split_controls(torch.arange(model.num_controls, device=model.device))
-            joint = model.join_controls(controls.to(model.device)[every[:, robots]])
-            found.append(Symmetry(model, torch.tensor(locations, device=model.device), joint, robots))
+            found.append(Symmetry(model, torch.tensor(locations, device=model.device), controls.to(model.device), robots))
     return found
 
 

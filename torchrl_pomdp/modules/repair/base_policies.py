@@ -70,7 +70,7 @@ class GreedyRepair(TensorDictModuleBase):
         intact = (belief[..., 0].T + self.damage_threshold).floor()
         controls = [self._robot_control(intact, location[:, robot]) for robot in range(self.model.num_robots)]
         action = self.model.join_controls(torch.stack(controls, -1))
-        return tensordict.set("action", action.view(tensordict.batch_size))
+        return tensordict.set("action", action.view((*tensordict.batch_size, *self.model.control_shape)))
 
     def _robot_control(self, intact: Tensor, location: Tensor) -> Tensor:
         """Control ``[N]`` of a robot at ``location`` ``[N]``, given the intact flags ``[L, N]``."""
@@ -130,7 +130,8 @@ class UrgencyRepair(TensorDictModuleBase):
         from torchrl_pomdp.modules.repair.scalar import engine, twins
 
         costs = self.model.costs.double()
-        data = self.nearness.double().numpy().T.copy(), float(costs[..., 0].max()), float((costs - costs[..., :1]).max())
+        intact = costs[..., 0].expand(self.model.num_locations).numpy().copy()
+        data = self.nearness.double().numpy().T.copy(), intact, float((costs - costs[..., :1]).max())
         return engine.repair_engine(twins.urgency, data, self.model, model, limits, numbers=self.model.num_robots)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -152,7 +153,8 @@ class UrgencyRepair(TensorDictModuleBase):
             controls.append(torch.where(highest > 0, control, self.first_moves[place]))
             if robot + 1 < model.num_robots:
                 costs = costs.scatter(0, target.unsqueeze(0), 0.0)
-        return tensordict.set("action", model.join_controls(torch.stack(controls, -1)).view(tensordict.batch_size))
+        action = model.join_controls(torch.stack(controls, -1))
+        return tensordict.set("action", action.view((*tensordict.batch_size, *model.control_shape)))
 
 
 def _columns(table: Tensor, location: Tensor) -> Tensor:

@@ -12,11 +12,12 @@ from torch.autograd.function import once_differentiable
 
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.repair.graphs import Graph
-from torchrl_pomdp.envs.repair.model import RepairModel
+from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
+from torchrl_pomdp.modules.agents import AgentEncoder
 from torchrl_pomdp.modules.encoders import Encoder, transformed
 from torchrl_pomdp.modules.rowwise import affine, align, align_terms
 
-__all__ = ["RelativeEncoder"]
+__all__ = ["RelativeEncoder", "RobotEncoder"]
 
 
 # Offsets that differ by less than this fraction of the graph's size are the same: coordinates are rounded.
@@ -202,3 +203,55 @@ def _ranks(values: Tensor, rounding: float) -> Tensor:
     ordered, inverse = values.unique(return_inverse=True)
     larger = ordered.diff() > rounding * float(ordered.abs().max())
     return nn.functional.pad(larger.cumsum(0), (1, 0))[inverse]
+
+
+class RobotEncoder(AgentEncoder):
+    """What a robot among many sees: beliefs, where all robots are, where it is itself, and where earlier ones go or repair.
+
+    Features are those of :class:`RelativeEncoder` by location, what is known of each, then how many robots are there. Marks are
+    the robot's number and location, and of earlier robots the locations that they go to or repair.
+
+    Args:
+        model: the repair model.
+
+    Examples:
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> encoder = RobotEncoder(make_problem("network32x10").model)
+        >>> encoder.num_features, encoder.num_marks
+        (192, 106)
+    """
+
+    keys = ("belief", "location")
+    model: RepairModel
+
+    def __init__(self, model: RepairModel) -> None:
+        super().__init__()
+        self.model = check_instance("model", model, RepairModel)
+        self.dtype = model.dtype
+        size = model.num_locations
+        self.num_features, self.num_marks = size * (model.num_levels + 1), model.num_robots + 3 * size
+
+    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
+        """See :class:`~torchrl_pomdp.modules.Encoder`."""
+        belief, location = y.get("belief"), y.get("location")
+        # A transposition of two dimensions is much faster than a general permutation.
+        planes = belief.permute(1, 2, 0).flatten(0, 1)
+        known = planes.T.clone(memory_format=torch.contiguous_format)
+        known[:, :: self.model.num_levels] = 1.0 - known[:, :: self.model.num_levels].floor()
+        robots = known.new_zeros(len(known), self.model.num_locations)
+        robots.scatter_add_(1, location, torch.ones_like(location, dtype=self.dtype))
+        features = torch.cat([known, robots], -1)
+        return features if rows is None else features.index_select(0, rows)
+
+    def own_marks(self, y: TensorDictBase) -> Tensor:
+        """The robot's number, and its location."""
+        location = y.get("location")
+        number = torch.arange(self.model.num_robots, device=location.device).expand_as(location)
+        return torch.stack([number, self.model.num_robots + location], -1)
+
+    def choice_marks(self, y: TensorDictBase, agents: slice, controls: Tensor) -> Tensor:
+        """The location that the robot goes to, or repairs."""
+        model = self.model
+        target = model.destinations[y.get("location")[:, agents], controls]
+        place = model.num_robots + model.num_locations * (1 + (controls == REPAIR).long()) + target
+        return place.unsqueeze(-1)

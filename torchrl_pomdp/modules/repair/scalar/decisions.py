@@ -1,4 +1,7 @@
-"""Q-factors of the repair problem by compiled simulations: all controls of a state in the same scenarios."""
+"""Q-factors of the repair problem by compiled simulations: all candidates of a state in the same scenarios.
+
+A candidate is a joint control, given as those of the robots: there may be far too many joint controls to number.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +25,19 @@ class Decisions(NamedTuple):
         beliefs: ``[N, L, K]``.
         locations: ``[N, R]``.
         keys: uint64 ``[N]``.
-        costs: of the trajectories that have been made, ``[N, n, U]``.
-        made: how many each control has, ``[N, U]``; all zero for new states.
-        rivals: the controls that get more, bool ``[N, U]``; set for new states.
-        q: gets the Q-factors, ``[N, U]``.
+        controls: the candidates, ``[N, C, R]``.
+        legal: gets which of them are legal, bool ``[N, C]``.
+        costs: of the trajectories that have been made, ``[N, n, C]``.
+        made: how many each candidate has, ``[N, C]``; all zero for new states.
+        rivals: the candidates that get more, bool ``[N, C]``; set for new states.
+        q: gets the Q-factors, ``[N, C]``.
     """
 
     beliefs: NDArray[np.float64]
     locations: NDArray[np.int64]
     keys: NDArray[np.uint64]
+    controls: NDArray[np.int64]
+    legal: NDArray[np.bool_]
     costs: NDArray[np.float64]
     made: NDArray[np.int64]
     rivals: NDArray[np.bool_]
@@ -55,13 +62,12 @@ def _some(flags):
 
 @inner
 def _control_mask(tables, start, location, controls, mask):
-    """Put into ``mask`` ``[U]`` which joint controls are legal."""
+    """Put into ``mask`` ``[C]`` which candidates ``[C, R]`` are legal."""
     for u in range(len(mask)):
-        split(u, tables.destinations.shape[1], controls)
         fits = True
         for robot in range(len(location)):
             place = location[robot]
-            fits = fits and legal_at(tables, place, np.float32(start[place, 0]) == np.float32(1.0), controls[robot])
+            fits = fits and legal_at(tables, place, np.float32(start[place, 0]) == np.float32(1.0), controls[u, robot])
         mask[u] = fits
 
 
@@ -80,23 +86,26 @@ def _observation_weight(tables, work, start, origin):
                     together = work.seen[other]
         if together >= 0:
             weight *= 1.0 if together == level else 0.0
-        elif fixed:
+        elif fixed and tables.works == 1.0:
             weight *= 1.0 if level == 0 else 0.0
         else:
             seen = 0.0
             for k in range(start.shape[1]):
-                seen += start[place, k] * tables.powers[1, k, level]
+                seen += start[place, k] * tables.powers[tables.kind[place], 1, k, level]
+            if fixed:
+                seen = (1.0 - tables.works) * seen + (tables.works if level == 0 else 0.0)
             weight *= seen
     return weight
 
 
 @inner
-def _pair_cost(policy, tables, limits, work, start, origin, u, noise, observations):
-    """Cost of a control and what follows it: in one trajectory, or in one from each observation, weighted."""
-    base, levels, robots = tables.destinations.shape[1], start.shape[1], len(origin)
+def _pair_cost(policy, tables, limits, work, start, origin, control, noise, observations):
+    """Cost of a candidate ``[R]`` and what follows it: in one trajectory, or in one from each observation, weighted."""
+    levels, robots = start.shape[1], len(origin)
     total, steps = 0.0, 0
     for z in range(levels**robots if observations else 1):
-        split(u, base, work.controls)
+        for robot in range(robots):
+            work.controls[robot] = control[robot]
         weight = 1.0
         if observations:
             split(z, levels, work.seen)
@@ -112,7 +121,7 @@ def _pair_cost(policy, tables, limits, work, start, origin, u, noise, observatio
 
 @inner
 def _drop_beaten(costs, spent, rivals, clearly):
-    """Take from ``rivals`` ``[U]`` what ``costs`` ``[n, U]`` show to be clearly beaten, as ``lookahead._rivals`` does."""
+    """Take from ``rivals`` ``[C]`` what ``costs`` ``[n, C]`` show to be clearly beaten, as ``lookahead._rivals`` does."""
     best, lowest = -1, np.inf
     for u in range(len(rivals)):
         if rivals[u]:
@@ -143,7 +152,7 @@ def _drop_beaten(costs, spent, rivals, clearly):
 
 @inner
 def _combine(costs, made, mask, q):
-    """Q-factors ``[U]`` from ``costs`` ``[n, U]``, of which each control has some, as ``lookahead._combine`` does."""
+    """Q-factors ``[C]`` from ``costs`` ``[n, C]``, of which each candidate has some, as ``lookahead._combine`` does."""
     most = _largest(made)
     best = -1
     for u in range(len(q)):
@@ -187,19 +196,22 @@ def decide(policy, tables, limits, work, states, order, rounds, observations, cl
     for row in range(len(states.keys)):
         start, origin, key = states.beliefs[row], states.locations[row], states.keys[row]
         costs, made, rivals = states.costs[row], states.made[row], states.rivals[row]
+        controls, mask = states.controls[row], states.legal[row]
         set_initial(start, work.initial)
-        _control_mask(tables, start, origin, work.controls, work.mask)
+        _control_mask(tables, start, origin, controls, mask)
         spent = _largest(made)
         if spent == 0:
             for u in range(len(rivals)):
-                rivals[u] = work.mask[u]
+                rivals[u] = mask[u]
         for each in rounds:
             for u in range(len(rivals)):
                 if not rivals[u]:
                     continue
                 for i in range(spent, spent + each):
                     noise = Noise(fold(key, np.uint64(order[i])), key, order[i], len(order), nothing_seen)
-                    cost, more, state = _pair_cost(policy, tables, limits, work, start, origin, u, noise, observations)
+                    cost, more, state = _pair_cost(
+                        policy, tables, limits, work, start, origin, controls[u], noise, observations
+                    )
                     if state == ILLEGAL:
                         return steps, row, True
                     costs[i, u] = cost
@@ -211,7 +223,7 @@ def decide(policy, tables, limits, work, states, order, rounds, observations, cl
             if not _some(rivals):
                 break
         q = states.q[row]
-        _combine(costs, made, work.mask, q)
+        _combine(costs, made, mask, q)
         for u in range(len(q)):
-            finite = finite and (not work.mask[u] or abs(q[u]) <= largest)
+            finite = finite and (not mask[u] or abs(q[u]) <= largest)
     return steps, -1, finite

@@ -13,14 +13,15 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.digits import digits
 from torchrl_pomdp.envs.partition import SinglePart
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
-from torchrl_pomdp.modules.lookahead import check_q_factors
+from torchrl_pomdp.modules.qfactors import check_q_factors
 from torchrl_pomdp.modules.repair.scalar.decisions import Decisions, decide
 from torchrl_pomdp.modules.repair.scalar.searches import History, repair_model
 from torchrl_pomdp.modules.repair.scalar.states import fingerprints, valid
-from torchrl_pomdp.modules.repair.scalar.tables import make_tables
+from torchrl_pomdp.modules.repair.scalar.tables import by_location, kinds, make_tables
 from torchrl_pomdp.modules.repair.scalar.trajectories import NEVER, Limits, Trajectories, Work, simulate
 from torchrl_pomdp.modules.repair.terminal_costs import NeverRepairCost, SteadyStateCost
 from torchrl_pomdp.modules.scalar import Allocation, Cut, Limited, Roots, ScalarEngine
@@ -94,13 +95,11 @@ def repair_engine(
     """
     if type(model) is not RepairModel or own.graph is not model.graph or not torch.equal(own.costs, model.costs):
         return None
-    # Locations of one kind, whose repairs work.
-    if model.chain.ndim > 2 or model.costs.ndim > 1 or model.repair_probability < 1.0:
-        return None
     rules = () if limits.truncation is None else limits.truncation.rules
     known = all(type(rule) in (AfterSteps, OnEntering, OnLeaving) for rule in rules)
     parted = all(isinstance(rule, AfterSteps) for rule in rules) or type(model.partition) in (RepairPartition, SinglePart)
-    small = (limits.max_steps + 2) * model.num_levels**2 <= _MOST_NUMBERS and model.num_locations**2 <= _MOST_NUMBERS
+    table_size = len(kinds(model)[0]) * (limits.max_steps + 2) * model.num_levels**2
+    small = table_size <= _MOST_NUMBERS and model.num_locations**2 <= _MOST_NUMBERS
     if not (known and parted and small):
         return None
     return RepairEngine((twin, data), model, limits, rules, numbers, refresh)
@@ -125,6 +124,8 @@ class RepairEngine(ScalarEngine):
         self.policy, self.model, self.numbers, self._refresh = policy, model, numbers, refresh
         self._loops = Loops()
         self._spare: list[Work] = []
+        # All joint controls, [U, R], once they have been asked for.
+        self._every: NDArray[np.int64] | None = None
         self.tables = make_tables(model, limits.max_steps + 2)
         after = [rule.m for rule in rules if isinstance(rule, AfterSteps)]
         self._varying = [m for m in after if not isinstance(m, int)]
@@ -134,7 +135,7 @@ class RepairEngine(ScalarEngine):
         at_once = [0] if entering and not parted else []
         closed = _closed_form(model, limits.terminal_cost)
         self.closed = closed is not None and not self._varying
-        constant, level_costs = closed or (0.0, np.zeros(0))
+        constant, level_costs = closed or (0.0, np.zeros((model.num_locations, 0)))
         self.limits = Limits(
             max_steps=min([limits.max_steps, *at_once, *(m for m in after if isinstance(m, int))]),
             entering=sum(1 << part for part in entering) if parted else 0,
@@ -179,7 +180,12 @@ class RepairEngine(ScalarEngine):
     # ---- decisions ---------------------------------------------------------------------------------------------------
 
     def q_factors(
-        self, y: TensorDictBase, keys: Tensor | None, seed: int, allocation: Allocation
+        self,
+        y: TensorDictBase,
+        keys: Tensor | None,
+        seed: int,
+        allocation: Allocation,
+        controls: NDArray[np.int64] | None = None,
     ) -> tuple[NDArray[np.float64], int]:
         """See :class:`ScalarEngine`."""
         self._bring_up_to_date()
@@ -188,13 +194,17 @@ class RepairEngine(ScalarEngine):
         if not self._call(valid, beliefs, location, SUM_TOLERANCE):
             self.model.check_state(y)
         streams = self._keys(belief, location, seed) if keys is None else np.ascontiguousarray(keys.numpy()).view(np.uint64)
-        shape = len(beliefs), self.model.num_controls
+        candidates = self._candidates(controls, len(beliefs))
+        shape = candidates.shape[:2]
         q, largest = np.empty(shape), float(torch.finfo(self.model.dtype).max)
 
         def run(rows: slice) -> int:
             own, steps = q[rows], 0
             costs, made = np.zeros((len(own), len(allocation.order), shape[1])), np.zeros(own.shape, np.int64)
-            states = Decisions(beliefs[rows], location[rows], streams[rows], costs, made, np.zeros(own.shape, np.bool_), own)
+            legal, rivals = np.zeros((2, *own.shape), np.bool_)
+            # A copy: compiled loops take arrays of one layout, and candidates that all states share are laid out here alone.
+            tried = np.array(candidates[rows], order="C")
+            states = Decisions(beliefs[rows], location[rows], streams[rows], tried, legal, costs, made, rivals, own)
             for rounds in allocation.stretches():
                 more, wrong, finite = self._call_with_memory(
                     decide, states, allocation.order, rounds, allocation.observations, allocation.clearly, largest
@@ -202,7 +212,7 @@ class RepairEngine(ScalarEngine):
                 if wrong >= 0:
                     self._refuse()
                 if not finite:
-                    check_q_factors(torch.from_numpy(own).to(self.model.dtype), self.model.action_mask(y).reshape(shape)[rows])
+                    check_q_factors(torch.from_numpy(own).to(self.model.dtype), torch.from_numpy(legal))
                 steps += more
                 if not states.rivals.any():
                     break
@@ -211,6 +221,22 @@ class RepairEngine(ScalarEngine):
         # Their trajectories' costs are kept until a state is decided. With a time for each, states are decided one by one.
         block = max(1, min(_STATES, _MOST_NUMBERS // (len(allocation.order) * shape[1])))
         return q, sum(self._threads(run, shape[0], block if allocation.seconds is None else 1))
+
+    def _candidates(self, controls: NDArray[np.int64] | None, count: int) -> NDArray[np.int64]:
+        """Candidates ``[N, C, R]`` of so many states: all joint controls if none are given."""
+        robots = self.model.num_robots
+        if controls is None:
+            if self._every is None:
+                every = torch.arange(self.model.num_controls)
+                self._every = digits(every, self.model.num_robot_controls, robots).numpy()
+            return np.broadcast_to(self._every, (count, *self._every.shape))
+        # The loop checks neither.
+        if controls.dtype != np.int64 or controls.ndim != 3 or controls.shape[::2] != (count, robots) or not controls.shape[1]:
+            raise ValueError(
+                f"controls must be int64 of shape ({count}, C, {robots}) with C at least 1, got {controls.dtype} of shape "
+                f"{controls.shape}"
+            )
+        return controls
 
     def _keys(self, belief: NDArray[Any], location: NDArray[np.int64], seed: int) -> NDArray[np.uint64]:
         # Adding zero turns -0.0, which compares equal to 0.0, into 0.0.
@@ -278,7 +304,6 @@ class RepairEngine(ScalarEngine):
             seen=np.empty(robots, np.int64),
             numbers=np.empty(self.numbers, np.float32),
             row=np.empty(model.num_levels),
-            mask=np.empty(model.num_controls, np.bool_),
         )
 
     def _threads(self, run: Callable[[slice], int], count: int, block: int) -> list[int]:
@@ -294,14 +319,17 @@ class RepairEngine(ScalarEngine):
 
 
 def _closed_form(model: RepairModel, terminal_cost: Any) -> tuple[float, NDArray[np.float64]] | None:
-    """A terminal cost as a constant and a cost for the level of each location; None where it is none of these."""
-    kind, nothing = type(terminal_cost), np.zeros(0)
+    """A terminal cost as a constant and a cost for each level of each location; None where it is none of these."""
+    kind, nothing = type(terminal_cost), np.zeros((model.num_locations, 0))
     if terminal_cost is None or kind is ZeroCost:
         return 0.0, nothing
     if kind is ConstantCost:
         return terminal_cost.cost, nothing
     if kind is NeverRepairCost:
-        return 0.0, np.array(terminal_cost.level_costs)
+        costs = torch.as_tensor(terminal_cost.level_costs, dtype=torch.float64)
+        # What does not fit, as it is of another model, is refused where tensors compute it.
+        fits = costs.shape in ((model.num_levels,), (model.num_locations, model.num_levels))
+        return (0.0, by_location(costs, model)) if fits else None
     if kind is SteadyStateCost and terminal_cost.model is model:
-        return 0.0, model.costs.double().numpy() / (1.0 - model.discount)
+        return 0.0, by_location(model.costs, model) / (1.0 - model.discount)
     return None

@@ -37,18 +37,18 @@ def terminal(view, witness):
 def level_at(view, place, stage, noise):
     """Level that a robot sees at ``place`` at a stage, in a scenario that draws the number ``noise``."""
     tables, levels = view.tables, view.start.shape[1]
-    n, known = stage - view.since[place], view.level[place]
+    n, known, kind = stage - view.since[place], view.level[place], tables.kind[place]
     if known >= 0:
-        threshold = noise * tables.cumulative[n, known, levels - 1]
+        threshold = noise * tables.cumulative[kind, n, known, levels - 1]
         for level in range(levels - 1):
-            if tables.cumulative[n, known, level] > threshold:
+            if tables.cumulative[kind, n, known, level] > threshold:
                 return level
         return levels - 1
     threshold, reached, possible = np.float64(noise), 0.0, 0
     for level in range(levels):
         here = 0.0
         for k in range(levels):
-            here += view.start[place, k] * tables.powers[n, k, level]
+            here += view.start[place, k] * tables.powers[kind, n, k, level]
         reached += here
         if here > 0.0:
             possible = level
@@ -62,12 +62,12 @@ def level_at(view, place, stage, noise):
 def interval_cost(view, place, stage):
     """Discounted cost of a location from when it was last seen until ``stage``."""
     tables, since, known = view.tables, view.since[place], view.level[place]
-    n = stage - since
+    n, kind = stage - since, tables.kind[place]
     if known >= 0:
-        return tables.discounts[since] * tables.interval_costs[n, known]
+        return tables.discounts[since] * tables.interval_costs[kind, n, known]
     total = 0.0
     for k in range(view.start.shape[1]):
-        total += view.start[place, k] * tables.interval_costs[n, k]
+        total += view.start[place, k] * tables.interval_costs[kind, n, k]
     return total
 
 
@@ -94,15 +94,25 @@ def look(view, controls, levels, noise, seen, age):
         place = view.location[robot]
         first = (seen & variable_bit(place)) == 0
         level = 0 if tables.steady and view.intact[place] == 1.0 else -1
+        # Robots that repair one location together make one attempt.
+        attempt = False
         for other in range(robots):
-            if view.location[other] == place and controls[other] == 0:
-                level = 0
+            attempt = attempt or (view.location[other] == place and controls[other] == 0)
+        if attempt and tables.works == 1.0:
+            level = 0
         for other in range(robot):
             if view.location[other] == place:
                 level = levels[other]
         if level < 0:
-            number = scenario_noise(noise.key, noise.group, noise.member, noise.of, first, place, age * robots + robot)
-            level = level_at(view, place, view.stage + 1, number)
+            number = np.float64(
+                scenario_noise(noise.key, noise.group, noise.member, noise.of, first, place, age * robots + robot)
+            )
+            if attempt and number < tables.works:
+                level = 0
+            else:
+                # Where an attempt fails, what is left of the number tells the level that the chain leads to.
+                left = (number - tables.works) / (1.0 - tables.works) if attempt else number
+                level = level_at(view, place, view.stage + 1, left)
         levels[robot] = level
 
 

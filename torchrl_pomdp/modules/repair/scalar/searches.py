@@ -174,12 +174,13 @@ def _arrival_cost(view, noise, place, n):
         while view.level[place] < 0 and lowest < levels - 1 and view.start[place, lowest] == 0.0:
             lowest += 1
     known, since, expected = view.level[place], view.stage + n - view.since[place], 0.0
+    kind = tables.kind[place]
     if known >= 0:
-        expected = tables.stage_costs[since, known]
+        expected = tables.stage_costs[kind, since, known]
     else:
         for k in range(levels):
-            expected += view.start[place, k] * tables.stage_costs[since, k]
-    return min(expected, tables.stage_costs[0, lowest])
+            expected += view.start[place, k] * tables.stage_costs[kind, since, k]
+    return min(expected, tables.stage_costs[kind, 0, lowest])
 
 
 def _relaxed(data, state, noise):
@@ -196,11 +197,17 @@ def _relaxed(data, state, noise):
         away = limits.max_steps - now
         for robot in range(len(state.origin)):
             away = min(away, tables.distances[view.location[robot], place])
-        # No robot has been there until then, so that it costs what is expected now.
-        last = now + max(away, 1)
+        # No robot has been there until then, so that it costs what is expected now; no attempt to repair works earlier.
+        last, kind = now + max(away, 1), tables.kind[place]
         total += interval_cost(view, place, last) - interval_cost(view, place, now)
-        if away > 0 and last < limits.max_steps:
+        arrives = away > 0 and last < limits.max_steps
+        if arrives:
             total += tables.discounts[last] * _arrival_cost(view, noise, place, away)
+        if tables.steady and not tables.free:
+            # Once nothing is damaged all is over: only what damage costs more is sure to be paid.
+            total -= tables.interval_costs[kind, last, 0] - tables.interval_costs[kind, now, 0]
+            if arrives:
+                total -= tables.discounts[last] * tables.stage_costs[kind, 0, 0]
     return total / tables.discounts[now]
 
 

@@ -2,34 +2,66 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
 from torchrl_pomdp.modules.repair.base_policies import first_moves
 from torchrl_pomdp.modules.repair.scalar.view import Tables
 
-__all__ = ["make_tables"]
+__all__ = ["by_location", "kinds", "make_tables"]
+
+
+def by_location(values: Tensor | Sequence[float], model: RepairModel) -> NDArray[np.float64]:
+    """Numbers for the levels, ``[K]`` or ``[L, K]``, as ``[L, K]``."""
+    own = torch.as_tensor(values, dtype=torch.float64).numpy()
+    return np.array(np.broadcast_to(own, (model.num_locations, model.num_levels)), order="C")
+
+
+def kinds(model: RepairModel) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The first location of each kind, ``[J]``, and the kind of each location, ``[L]``.
+
+    Kinds differ in their chains, or in their costs, be it those of the partition.
+    """
+    size = model.num_locations
+    own = [by_location(model.costs, model), _prices(model)]
+    if model.chain.ndim == 3:
+        own.append(model.chain.double().numpy().reshape(size, -1))
+    _, first, kind = np.unique(np.concatenate(own, 1), axis=0, return_index=True, return_inverse=True)
+    return first, kind.reshape(size)
+
+
+def _prices(model: RepairModel) -> NDArray[np.float64]:
+    """Cost of every level as the partition has them, ``[L, K]``."""
+    own = model.partition
+    return by_location(own.prices if isinstance(own, RepairPartition) else model.costs, model)
 
 
 def make_tables(model: RepairModel, stages: int) -> Tables:
     """What the kernel reads of a model, for so many stages."""
-    chain, costs = model.chain.double().numpy(), model.costs.double().numpy()
     size, levels = model.num_locations, model.num_levels
-    powers = np.empty((stages, levels, levels))
-    powers[0] = np.eye(levels)
-    for n in range(1, stages):
-        powers[n] = powers[n - 1] @ chain
+    first, kind = kinds(model)
+    chain = np.broadcast_to(model.chain.double().numpy(), (size, levels, levels))[first]
+    costs, prices = by_location(model.costs, model)[first], _prices(model)
     discounts = np.power(model.discount, np.arange(stages), dtype=np.float64)
-    stage_costs, interval_costs = powers @ costs, np.zeros((stages, levels))
-    # What overflows is refused where it is a result.
-    with np.errstate(over="ignore"):
-        interval_costs[1:] = np.cumsum(discounts[:-1, None] * stage_costs[:-1], 0)
+    powers, stage_costs, interval_costs = (
+        np.stack(each) for each in zip(*(_of_kind(*own, discounts) for own in zip(chain, costs, strict=True)), strict=True)
+    )
+    damage = np.zeros_like(stage_costs)
+    for k in range(levels):
+        # Summed as the loop sums what it does not read here.
+        damage += powers[..., k] * prices[first, None, None, k]
     distances = model.graph.distances.numpy()
     absorbing = model.level_zero_absorbing
-    steady = absorbing and bool((chain[1:, 0] == 0).all())
+    steady = absorbing and bool((chain[:, 1:, 0] == 0).all())
     own = model.partition if isinstance(model.partition, RepairPartition) else None
     return Tables(
+        kind=kind,
         powers=powers,
         cumulative=np.cumsum(powers, -1),
         stage_costs=stage_costs,
@@ -42,14 +74,31 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
         first_moves=first_moves(model).numpy(),
         unrestricted=bool(model.legal_when_intact()[:, REPAIR].all()),
         columns=np.zeros(size) if own is None else own.columns.double().numpy(),
-        prices=np.array(costs if own is None else own.prices, np.float64),
+        prices=prices,
+        damage=damage,
+        works=model.repair_probability,
         absorbing=absorbing,
         steady=steady,
-        free=steady and costs[0] == 0.0,
-        upward=bool((np.tril(chain, -1) == 0).all() and costs[0] >= 0.0 and (np.diff(costs) >= 0.0).all()),
+        free=steady and bool((costs[:, 0] == 0.0).all()),
+        upward=bool((np.tril(chain, -1) == 0).all() and (costs[:, 0] >= 0.0).all() and (np.diff(costs) >= 0.0).all()),
         least_cost=float(costs.min()),
         terminal_probability=model.terminal_probability,
         damage_threshold=0.0 if own is None else own.damage_threshold,
         low=0.0 if own is None else own.density_bounds[0],
         high=0.0 if own is None else own.density_bounds[1],
     )
+
+
+def _of_kind(
+    chain: NDArray[np.float64], costs: NDArray[np.float64], discounts: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Powers ``[n, K, K]``, costs of a stage ``[n, K]`` and of all stages before it ``[n, K]`` of one kind of locations."""
+    powers = np.empty((len(discounts), *chain.shape))
+    powers[0] = np.eye(len(chain))
+    for n in range(1, len(discounts)):
+        powers[n] = powers[n - 1] @ chain
+    stage_costs, interval_costs = powers @ costs, np.zeros((len(discounts), len(chain)))
+    # What overflows is refused where it is a result.
+    with np.errstate(over="ignore"):
+        interval_costs[1:] = np.cumsum(discounts[:-1, None] * stage_costs[:-1], 0)
+    return powers, stage_costs, interval_costs

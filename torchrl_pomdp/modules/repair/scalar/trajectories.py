@@ -61,7 +61,7 @@ class Limits(NamedTuple):
         leaving: whether leaving the first part cuts.
         closed: whether a cut adds ``constant`` and ``level_costs``; else cut trajectories report their states.
         constant: cost of a cut.
-        level_costs: cost of a cut by the level of each location, ``[K]``; ``[0]`` where it depends on none.
+        level_costs: cost of a cut by the level of each location, ``[L, K]``; ``[L, 0]`` where it depends on none.
     """
 
     max_steps: int
@@ -84,7 +84,6 @@ class Work(NamedTuple):
     seen: NDArray[np.int64]
     numbers: NDArray[np.float32]
     row: NDArray[np.float64]
-    mask: NDArray[np.bool_]
 
 
 class Trajectories(NamedTuple):
@@ -129,8 +128,8 @@ def _closed_cost(view, limits):
     """Terminal cost in closed form."""
     total = limits.constant
     for place in range(len(view.level)):
-        for k in range(len(limits.level_costs)):
-            total += probability(view, place, k) * limits.level_costs[k]
+        for k in range(limits.level_costs.shape[1]):
+            total += probability(view, place, k) * limits.level_costs[place, k]
     return total
 
 

@@ -47,7 +47,7 @@ def greedy(data, view, controls):
 def urgency(data, view, controls):
     """The location with the largest extra cost over a power of the distance.
 
-    ``data`` holds the inverse of these powers, the cost of an intact location, and the largest extra cost.
+    ``data`` holds the inverse of these powers, the cost of each location that is intact, and the largest extra cost.
     """
     tables, (nearness, intact_cost, highest) = view.tables, data
     targets = view.work
@@ -65,7 +65,7 @@ def urgency(data, view, controls):
             taken = False
             for other in range(robot):
                 taken = taken or targets[other] == place
-            urgent = 0.0 if taken else (expected_cost(view, place) - intact_cost) * near
+            urgent = 0.0 if taken else (expected_cost(view, place) - intact_cost[place]) * near
             if urgent > best or (urgent == best and 0 <= place < chosen):
                 best, chosen = urgent, place
         targets[robot] = chosen

@@ -1,7 +1,8 @@
 """What a compiled simulation of the repair problem shows: the model as tables, and the state of a trajectory.
 
 Between two looks at a location its belief evolves without noise. Its belief and its expected cost at any stage are thus read
-from a table, given when and at which level it was last seen.
+from a table, given when and at which level it was last seen. Locations of one kind, that is of equal chains and costs, share
+tables.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ class Tables(NamedTuple):
     r"""What simulations read of a model.
 
     Attributes:
-        powers: :math:`P^n`, ``[n, K, K]``.
-        cumulative: the same, summed over the levels up to each, ``[n, K, K]``.
-        stage_costs: :math:`(P^nc)_k`, ``[n, K]``.
-        interval_costs: :math:`C_{nk}`, ``[n, K]``.
+        kind: of each location, a number below J, ``[L]``.
+        powers: :math:`P^n`, by kind, ``[J, n, K, K]``.
+        cumulative: the same, summed over the levels up to each, ``[J, n, K, K]``.
+        stage_costs: :math:`(P^nc)_k`, by kind, ``[J, n, K]``.
+        interval_costs: :math:`C_{nk}`, by kind, ``[J, n, K]``.
         discounts: :math:`\alpha^n`, ``[n]``.
         destinations: location after a robot's control, -1 where the move leaves the graph, ``[L, A]``.
         order: all locations by their distance from one, then by number, ``[L, L]``.
@@ -32,18 +34,21 @@ class Tables(NamedTuple):
         first_moves: the lowest move at a location, or repair where there is none, ``[L]``.
         unrestricted: whether intact locations may be repaired.
         columns: the partition's columns, ``[L]``.
-        prices: cost of every level, as the partition has them, ``[K]``.
-        absorbing: whether level 0 is, so that there are terminal states.
-        steady: whether, moreover, no other level leads to level 0.
-        free: whether, moreover, level 0 costs nothing.
+        prices: cost of every level, as the partition has them, ``[L, K]``.
+        damage: :math:`(P^np)_k` with these costs p, by kind, ``[J, n, K]``.
+        works: :math:`\rho`, that an attempt to repair works.
+        absorbing: whether level 0 is everywhere, so that there are terminal states.
+        steady: whether, moreover, no other level leads to level 0 anywhere.
+        free: whether, moreover, level 0 costs nothing anywhere.
         upward: whether levels never fall by themselves, higher ones cost no less, and none costs less than nothing.
-        least_cost: of a level.
+        least_cost: of a level, anywhere.
         terminal_probability: :math:`\epsilon`.
         damage_threshold: of the partition.
         low: density bound of the partition.
         high: the other one.
     """
 
+    kind: NDArray[np.int64]
     powers: NDArray[np.float64]
     cumulative: NDArray[np.float64]
     stage_costs: NDArray[np.float64]
@@ -57,6 +62,8 @@ class Tables(NamedTuple):
     unrestricted: bool
     columns: NDArray[np.float64]
     prices: NDArray[np.float64]
+    damage: NDArray[np.float64]
+    works: float
     absorbing: bool
     steady: bool
     free: bool
@@ -99,24 +106,24 @@ class View(NamedTuple):
 @inner
 def probability(view, place, level):
     """Probability now that a location is at a level."""
-    n, known = view.stage - view.since[place], view.level[place]
+    n, known, kind = view.stage - view.since[place], view.level[place], view.tables.kind[place]
     if known >= 0:
-        return view.tables.powers[n, known, level]
+        return view.tables.powers[kind, n, known, level]
     total = 0.0
     for k in range(view.start.shape[1]):
-        total += view.start[place, k] * view.tables.powers[n, k, level]
+        total += view.start[place, k] * view.tables.powers[kind, n, k, level]
     return total
 
 
 @inner
 def expected_cost(view, place):
     """Expected cost of a location at this stage."""
-    n, known = view.stage - view.since[place], view.level[place]
+    n, known, kind = view.stage - view.since[place], view.level[place], view.tables.kind[place]
     if known >= 0:
-        return view.tables.stage_costs[n, known]
+        return view.tables.stage_costs[kind, n, known]
     total = 0.0
     for k in range(view.start.shape[1]):
-        total += view.start[place, k] * view.tables.stage_costs[n, k]
+        total += view.start[place, k] * view.tables.stage_costs[kind, n, k]
     return total
 
 
@@ -175,8 +182,11 @@ def part_of(view):
         side = centre - tables.columns[place] * robots
         if side >= 1.0 or side <= -1.0:
             cost = 0.0
-            for k in range(view.start.shape[1]):
-                cost += probability(view, place, k) * tables.prices[k]
+            if view.level[place] >= 0:
+                cost = tables.damage[tables.kind[place], view.stage - view.since[place], view.level[place]]
+            else:
+                for k in range(view.start.shape[1]):
+                    cost += probability(view, place, k) * tables.prices[place, k]
             if side >= 1.0:
                 left += cost
             else:

@@ -1,0 +1,184 @@
+r"""One policy network for many agents: it is called once for each, which sees what the earlier ones have chosen.
+
+A network over joint controls would have :math:`A^R` outputs. This one has A: the agents, such as robots, decide in turn, as in
+:class:`~torchrl_pomdp.modules.MultiagentRollout`, whose labels it learns.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_pomdp.checks import check_instance, check_sizes
+from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
+from torchrl_pomdp.modules.networks import LocalNetwork, check_finite_output
+from torchrl_pomdp.modules.rowwise import RowLinear, rowwise
+from torchrl_pomdp.modules.scalar import Limited, SearchEngine
+from torchrl_pomdp.tensor_checks import check_entries
+
+__all__ = ["AgentEncoder", "AgentNetwork", "FlatAgentEncoder"]
+
+
+class AgentEncoder(Encoder):
+    """What one agent of many sees: the features of the feature state, and marks of its own and of earlier agents' choices.
+
+    A mark is a feature that is 0 or 1, given by its number: a network adds up the weights of those that are 1.
+
+    Attributes:
+        model: the belief model.
+        num_marks: number of different marks.
+    """
+
+    model: BeliefModel
+    num_marks: int
+
+    @abstractmethod
+    def own_marks(self, y: TensorDictBase) -> Tensor:
+        """Marks of every agent, int64 ``[N, R, P]``, for feature states ``[N]``."""
+
+    @abstractmethod
+    def choice_marks(self, y: TensorDictBase, agents: slice, controls: Tensor) -> Tensor:
+        """Marks of controls ``[N, n]`` that some agents have chosen, int64 ``[N, n, Q]``, seen by all later ones."""
+
+
+class FlatAgentEncoder(AgentEncoder):
+    """For any model: the flattened feature state, which agent it is, and which agent has chosen which control.
+
+    Args:
+        model: the belief model.
+
+    Examples:
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> encoder = FlatAgentEncoder(make_problem("two_robots20").model)
+        >>> encoder.num_features, encoder.num_marks
+        (140, 8)
+    """
+
+    def __init__(self, model: BeliefModel) -> None:
+        super().__init__()
+        self.model, self._flat = check_instance("model", model, BeliefModel), FlatEncoder(model)
+        self.keys, self.num_features, self.dtype = self._flat.keys, self._flat.num_features, model.dtype
+        self.num_marks = model.num_agents * (1 + model.num_agent_controls)
+
+    def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
+        """See :class:`Encoder`."""
+        return self._flat.encode_rows(y, rows)
+
+    def own_marks(self, y: TensorDictBase) -> Tensor:
+        """The number of the agent."""
+        return torch.arange(self.model.num_agents, device=y.device).view(1, -1, 1).expand(y.batch_size[0], -1, -1)
+
+    def choice_marks(self, y: TensorDictBase, agents: slice, controls: Tensor) -> Tensor:
+        """The agent together with its control."""
+        which = torch.arange(self.model.num_agents, device=y.device)[agents]
+        return (self.model.num_agents + which * self.model.num_agent_controls + controls).unsqueeze(-1)
+
+
+class AgentNetwork(LocalNetwork):
+    r"""Policy network that all agents share; writes ``"logits"`` ``[*B, R, A]`` and ``"action"`` ``[*B, *S]``.
+
+    The agents decide in turn. Logits are ``-inf`` where a control is illegal for the agent, and an agent takes the most
+    probable one. Where the entry ``"told"``, int64 ``[*B, R]``, is there, agents see these controls of the earlier ones instead
+    of what the network has chosen for them: the network is taught with those of the labels.
+
+    Args:
+        encoder: encoder of what an agent sees.
+        hidden: sizes of the hidden layers, at least one.
+        generator: generator of the initial weights; the global one is left alone.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if there is no hidden layer.
+
+    Examples:
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> model = make_problem("two_robots20").model
+        >>> network = AgentNetwork(FlatAgentEncoder(model), generator=torch.Generator().manual_seed(0))
+        >>> y = network(model.with_features(make_problem("two_robots20").start(torch.arange(6))))
+        >>> y["logits"].shape, y["action"].shape
+        (torch.Size([6, 2, 3]), torch.Size([6]))
+    """
+
+    out_keys = ["logits", "action"]
+
+    def __init__(self, encoder: AgentEncoder, hidden: Sequence[int] = (256, 64), *, generator: torch.Generator) -> None:
+        model = check_instance("encoder", encoder, AgentEncoder).model
+        sizes = check_sizes("hidden", hidden)
+        if not sizes:
+            raise ValueError("hidden must hold at least one size, got none")
+        super().__init__(encoder, [*sizes, model.num_agent_controls], generator)
+        self.in_keys = list(encoder.keys)
+        bound = (encoder.num_features + encoder.num_marks) ** -0.5
+        marks = torch.empty(encoder.num_marks, sizes[0], dtype=encoder.dtype, device=generator.device)
+        self.marks = nn.Parameter(nn.init.uniform_(marks, -bound, bound, generator=generator))
+
+    @property
+    def model(self) -> BeliefModel:
+        """The belief model."""
+        return cast(AgentEncoder, self.encoder).model
+
+    @property
+    def kind(self) -> None:
+        """It is evaluated alone."""
+        return None
+
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> SearchEngine | None:
+        """None: tensors simulate."""
+        return None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"logits"`` and ``"action"`` for feature states ``[*B]``."""
+        told = check_instance("tensordict", tensordict, TensorDictBase).get("told", None)
+        keys = self.in_keys if told is None else [*self.in_keys, "told"]
+        flat = check_entries("tensordict", tensordict, keys).select(*keys).reshape(-1)
+        logits, controls = self._decide(flat) if told is None else self._taught(flat)
+        action = self.model.join_controls(controls)
+        entries = TensorDict({"logits": logits, "action": action}, batch_size=flat.batch_size)
+        return tensordict.update(entries.reshape(tensordict.batch_size))
+
+    def _first(self, y: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """What the first layer makes of the state ``[N, H]``, and legal controls ``[N, R, A]``."""
+        features = self.encoder.encode_rows(y, None)
+        return rowwise(cast(RowLinear, self.network[0]), features), self.model.agent_mask(y)
+
+    def _rest(self, hidden: Tensor, mask: Tensor) -> Tensor:
+        """Logits ``[M, A]`` of what the first layer gives, ``[M, H]``."""
+        logits = rowwise(self.network[1:], hidden).masked_fill(~mask, -torch.inf)
+        check_finite_output("logits", logits.amax(-1))
+        return logits
+
+    def _weights(self, marks: Tensor) -> Tensor:
+        """Sums ``[..., H]`` of the weights of marks ``[..., P]``."""
+        total = self.marks.index_select(0, marks[..., 0].reshape(-1))
+        for place in range(1, marks.shape[-1]):
+            total = total + self.marks.index_select(0, marks[..., place].reshape(-1))
+        return total.view(*marks.shape[:-1], -1)
+
+    def _decide(self, y: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Logits ``[N, R, A]`` and controls ``[N, R]``, one agent after the other."""
+        encoder = cast(AgentEncoder, self.encoder)
+        (hidden, mask), own = self._first(y), encoder.own_marks(y)
+        logits: list[Tensor] = []
+        controls: list[Tensor] = []
+        for agent in range(self.model.num_agents):
+            logits.append(self._rest(hidden + self._weights(own[:, agent]), mask[:, agent]))
+            controls.append(logits[-1].argmax(-1))
+            choice = encoder.choice_marks(y, slice(agent, agent + 1), controls[-1].unsqueeze(-1))
+            hidden = hidden + self._weights(choice.squeeze(1))
+        return torch.stack(logits, 1), torch.stack(controls, 1)
+
+    def _taught(self, y: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """The same where the earlier agents' controls are told: all agents at once."""
+        encoder, told = cast(AgentEncoder, self.encoder), y.get("told")
+        hidden, mask = self._first(y)
+        choices = self._weights(encoder.choice_marks(y, slice(None), told))
+        earlier = choices.cumsum(1) - choices
+        hidden = hidden.unsqueeze(1) + self._weights(encoder.own_marks(y)) + earlier
+        logits = self._rest(hidden.flatten(0, 1), mask.flatten(0, 1)).view(mask.shape)
+        return logits, logits.argmax(-1)
