@@ -53,7 +53,7 @@ from _valid import (
 )
 
 from torchrl_pomdp import collectors, modules, objectives, trainers
-from torchrl_pomdp.modules import AfterSteps, FlatEncoder, ZeroCost
+from torchrl_pomdp.modules import FlatEncoder, ZeroCost
 from torchrl_pomdp.modules.repair import NeverRepairCost
 from torchrl_pomdp.trainers import checkpoint, run
 
@@ -176,11 +176,7 @@ TRAINERS = {
     ),
     "trainers.papi_nt": lambda _: an_algorithm(trainers.papi_nt),
     "trainers.papi_t": lambda _: an_algorithm(trainers.papi_t),
-    "trainers.api": lambda _: an_algorithm(
-        trainers.api,
-        partitioned=False,
-        truncation=(AfterSteps(3), [wrong for wrong in objects(AfterSteps) if wrong.value is not None]),
-    ),
+    "trainers.api": lambda _: an_algorithm(trainers.api, partitioned=False),
     "trainers.ppo": lambda _: case(
         trainers.ppo,
         problem=a_problem(),
@@ -258,8 +254,8 @@ def a_step(step):
     return case(step, parts=((0,), sequences((0,), *PARTS)), truncation=(None, objects(modules.AfterSteps)))
 
 
-def an_algorithm(algorithm, *, partitioned=True, **more):
-    return case(algorithm, problem=a_problem(partitioned=partitioned), config=a_config(), base_policy=a_module(), **more)
+def an_algorithm(algorithm, *, partitioned=True):
+    return case(algorithm, problem=a_problem(partitioned=partitioned), config=a_config(), base_policy=a_module())
 
 
 def an_architecture(make, **more):

@@ -9,7 +9,9 @@ import pytest
 
 from torchrl_pomdp.config import PolicyIterationConfig
 
-NUMBERS = [f.name for f in fields(PolicyIterationConfig) if isinstance(f.default, (int, float)) and f.name != "symmetries"]
+NUMBERS = [
+    f.name for f in fields(PolicyIterationConfig) if isinstance(f.default, (int, float)) and not isinstance(f.default, bool)
+]
 COUNTS = [f.name for f in fields(PolicyIterationConfig) if type(f.default) is int and f.name != "seed"]
 
 

@@ -115,9 +115,10 @@ class Compare:
 class Reproduce:
     """Carry out one of the paper's experiments; the same command goes on with an interrupted one."""
 
-    experiment: tyro.conf.Positional[Literal["table1", "architectures", "ablation", "optimum"]]
+    experiment: tyro.conf.Positional[Literal["table1", "architectures", "ablation", "optimum", "multirobot", "extensions"]]
     """table1: the grids and two robots; architectures: API, pAPI-NT and pAPI-T; ablation: rollout and iteration apart; optimum:
-    the line of 3, whose optimal cost is known."""
+    the line of 3, whose optimal cost is known; multirobot: 4, 8 and 10 robots on a network; extensions: obstacles, repairs that
+    may fail, locations of many kinds."""
 
     scale: float = 0.05
     """Fraction of the paper's samples; 1 is the paper's."""

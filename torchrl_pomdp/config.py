@@ -16,8 +16,9 @@ EVALUATION_SEED = 20200
 MAX_STATES = 10**8
 # Counts, from 1, with their largest values: above any use, below what no machine could hold or finish.
 _COUNTS = {
-    "iterations": 1000, "samples_per_part": 10**9, "trajectories": 10**6, "max_steps": 10**6, "memory_capacity": 10**9,
-    "value_samples": 10**9, "batch_size": 10**7, "epochs": 10**6, "least_steps": 10**9, "validation_states": MAX_STATES,
+    "iterations": 1000, "samples_per_part": 10**9, "trajectories": 10**6, "max_steps": 10**6, "label_steps": 10**6,
+    "memory_capacity": 10**9, "value_samples": 10**9, "batch_size": 10**7, "epochs": 10**6, "least_steps": 10**9,
+    "validation_states": MAX_STATES,
 }  # fmt: skip
 _INTERVALS = {"visited_share": "[0, 1]", "exploration": "[0, 1]", "visits_per_label": "(0, 1000]", "learning_rate": "(0, 1]"}
 _WIDEST, _DEEPEST = 1 << 14, 16
@@ -56,6 +57,10 @@ class PolicyIterationConfig:
 
     max_steps: int | None = None
     """Stages after which a simulated trajectory is cut; None: as many as the discount asks for, 400 for 0.99."""
+
+    label_steps: int | None = None
+    """Stages after which the trajectory of a label is cut and the terminal cost added, the problem's pessimistic cost where no
+    value network is; None: as max_steps says. Cuts make labels of many robots affordable."""
 
     visited_share: float = 0.7
     """Share of the training states taken from the memory of visited states, in [0, 1]; the rest are random."""
@@ -118,7 +123,7 @@ class PolicyIterationConfig:
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
     """A field's value as it is kept."""
-    if name == "max_steps" and value is None:
+    if name in ("max_steps", "label_steps") and value is None:
         return None
     if name in _COUNTS:
         return check_integer(name, value, 1, _COUNTS[name])

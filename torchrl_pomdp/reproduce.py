@@ -62,14 +62,25 @@ PUBLISHED = {
     ("two_robots20", "greedy"): 4142.84,
     ("two_robots20", "pAPI-NT 1"): 3321.95,
     ("two_robots20", "pAPI-NT 2"): 3133.08,
+    **{
+        (f"network32x{robots}", policy): float(cost)
+        for robots, costs in {
+            4: {"greedy": 3277, "one-at-a-time of greedy": 1926, "order-optimised of greedy": 1893, "R-NT of greedy": 1880},
+            8: {"greedy": 5347, "one-at-a-time of greedy": 992, "API 1": 2329, "API 2": 1266, "API 3": 1162, "API 4": 1206},
+            10: {"greedy": 4667, "one-at-a-time of greedy": 799, "API 1": 1878, "API 2": 1311, "API 3": 1240, "API 4": 1293},
+        }.items()
+        for policy, cost in costs.items()
+    },
 }
-"""Costs of the paper's Table I by problem and policy."""
+"""Costs of the paper's Table I by problem and policy; for the network of 32 those of arXiv:2011.04222, whose start states are
+other ones."""
 
 OPTIMA = {"line3": 168.97}
 """Optimal costs of problems that are small enough to be solved, to two decimals (by a point-based solver)."""
 
 # Labelled states of each part in the paper.
-_SAMPLES = {"linear20": 200_000, "line3": 200_000}
+_SAMPLES = {"linear20": 200_000, "line3": 200_000, "linear20_slow_repair": 200_000, "linear20_uneven": 200_000}
+_MANY_ROBOTS = ("network32x4", "network32x8", "network32x10")
 _MORE_SAMPLES = 500_000
 
 
@@ -110,6 +121,8 @@ EXPERIMENTS = {
         Experiment("ablation", ("linear20",), ("pAPI-NT", "pAPI-T")),
         # Differences from the optimum are small, and so is the problem.
         Experiment("optimum", ("line3",), ("pAPI-NT",), states=100_000),
+        Experiment("multirobot", ("network32x4", "network32x8", "network32x10"), ("API",)),
+        Experiment("extensions", ("grid6x6_obstacles", "linear20_slow_repair", "linear20_uneven"), ("pAPI-NT",)),
     )
 }
 """The experiments by name."""
@@ -139,11 +152,24 @@ def settings_config(settings: Literal["paper", "tuned"], problem: str, scale: fl
     check_number("scale", scale, "(0, 100]")
     samples = max(1, round(scale * _SAMPLES.get(problem, _MORE_SAMPLES)))
     common = PolicyIterationConfig(samples_per_part=samples, value_samples=samples, seed=seed)
+    if problem in _MANY_ROBOTS:
+        # Every labelled state teaches a decision of each robot.
+        common = replace(
+            common,
+            iterations=4,
+            multiagent=True,
+            label_steps=5 if settings == "tuned" else 10,
+            trajectories=3,
+            visits_per_label=0.2,
+            batch_size=64,
+            hidden=(128, 32),
+            validation_states=1000,
+        )
     if settings == "tuned":
         return common
     return replace(
         common,
-        iterations=2,
+        iterations=common.iterations if problem in _MANY_ROBOTS else 2,
         trajectories=10,
         encoder="flat",
         loss="l2",

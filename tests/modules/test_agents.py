@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from _oracles import random_states, small_model
+from tensordict import TensorDict
 
 from torchrl_pomdp.envs.repair import line
-from torchrl_pomdp.modules import AfterSteps, AgentNetwork, FlatAgentEncoder, MultiagentRollout, PartitionedPolicy
+from torchrl_pomdp.modules import AgentNetwork, FlatAgentEncoder, MultiagentRollout, PartitionedPolicy
 from torchrl_pomdp.modules.repair import GreedyRepair, RobotEncoder, SteadyStateCost
 from torchrl_pomdp.objectives import ClassificationLoss
 from torchrl_pomdp.problems import make_problem
@@ -34,6 +37,7 @@ def by_hand(network, y, told=None):
     for agent in range(MODEL.num_agents):
         marks = seen + torch.nn.functional.one_hot(own[:, agent], encoder.num_marks).sum(1)
         out = features @ layers[0].weight.T + layers[0].bias + marks @ network.marks
+        out = out + encoder.own_features(y)[:, agent] @ network.own
         for layer in layers[1:]:
             out = out.relu() @ layer.weight.T + layer.bias
         logits.append(out.masked_fill(~MODEL.agent_mask(y)[:, agent], -torch.inf))
@@ -52,6 +56,21 @@ def test_agents_decide_in_turn(network):
     torch.testing.assert_close(found["logits"], logits)
     assert torch.equal(MODEL.split_controls(found["action"]), controls)
     assert len(found["action"].unique()) > 5
+
+
+def test_how_much_damage_lies_each_way_by_hand():
+    """Robots at 0 and 2 of a line of 4, damage at 3 alone, which costs 5 more than an intact location does."""
+    model = small_model(line(4), num_robots=2, dtype=torch.float64)
+    belief = torch.eye(3, dtype=torch.float64)[torch.tensor([[0, 0, 0, 2]])]
+    y = TensorDict({"belief": belief, "location": torch.tensor([[0, 2]])}, [1])
+    found = RobotEncoder(model).own_features(y)[0].view(2, 2, 3, 3)
+    near = 1 / 4**3 + 1 / 2**3
+    for robot, distance in ((0, 3), (1, 1)):
+        for power in range(3):
+            alone = 5 / (distance + 1) ** (power + 1)
+            for row, expected in ((0, alone), (1, alone / near)):
+                # Controls are repair, left, right.
+                assert found[robot, row, :, power].tolist() == pytest.approx([0.0, 0.0, math.log1p(expected)])
 
 
 def test_what_agents_are_told_takes_the_place_of_choices(network):
@@ -89,18 +108,25 @@ def test_policy_iteration_of_many_agents(name, tmp_path):
     """Trained on one-at-a-time labels; a run goes on where it stopped; the policy is kept in a file."""
     problem = make_problem(name, partitioned=False)
     config = PolicyIterationConfig(
-        iterations=2, samples_per_part=120, least_steps=60, validation_states=20, hidden=(16,), trajectories=2, multiagent=True
+        iterations=2,
+        samples_per_part=120,
+        least_steps=60,
+        validation_states=20,
+        hidden=(16,),
+        trajectories=2,
+        multiagent=True,
+        label_steps=3,
     )
     # Nothing is better than a policy that nearly never repairs: the first iteration is accepted.
     base = GreedyRepair(problem.model)
-    run = api(problem, config, base, truncation=AfterSteps(3), folder=tmp_path / "run")
+    run = api(problem, config, base, folder=tmp_path / "run")
     policies = [iteration.policy for iteration in run]
     assert all(isinstance(policy.policies[0], AgentNetwork) for policy in policies)
     y = problem.model.with_features(problem.start(torch.arange(20)))
     u = policies[-1](y.clone())["action"]
     problem.model.check_controls(y, u)
     (tmp_path / "run" / "iteration-2").rename(tmp_path / "gone")
-    again = [iteration.policy for iteration in api(problem, config, base, truncation=AfterSteps(3), folder=tmp_path / "run")]
+    again = [iteration.policy for iteration in api(problem, config, base, folder=tmp_path / "run")]
     assert torch.equal(again[-1](y.clone())["action"], u)
     checkpoint = Checkpoint(problem, config, "API", 2, policies[-1], run_value(problem))
     save_checkpoint(tmp_path / "best.pt", checkpoint)

@@ -18,7 +18,7 @@ from torchrl_pomdp.checks import check_instance, check_sizes
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.networks import LocalNetwork, check_finite_output
-from torchrl_pomdp.modules.rowwise import RowLinear, rowwise
+from torchrl_pomdp.modules.rowwise import RowLinear, product, rowwise
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine
 from torchrl_pomdp.tensor_checks import check_entries
 
@@ -26,17 +26,23 @@ __all__ = ["AgentEncoder", "AgentNetwork", "FlatAgentEncoder"]
 
 
 class AgentEncoder(Encoder):
-    """What one agent of many sees: the features of the feature state, and marks of its own and of earlier agents' choices.
+    """What one agent of many sees: the features of the feature state, features and marks of its own, marks of earlier choices.
 
     A mark is a feature that is 0 or 1, given by its number: a network adds up the weights of those that are 1.
 
     Attributes:
         model: the belief model.
+        num_own: number of an agent's own features.
         num_marks: number of different marks.
     """
 
     model: BeliefModel
+    num_own: int
     num_marks: int
+
+    @abstractmethod
+    def own_features(self, y: TensorDictBase) -> Tensor:
+        """Features of every agent's own, ``[N, R, num_own]``, for feature states ``[N]``; a row depends on its state alone."""
 
     @abstractmethod
     def own_marks(self, y: TensorDictBase) -> Tensor:
@@ -64,11 +70,15 @@ class FlatAgentEncoder(AgentEncoder):
         super().__init__()
         self.model, self._flat = check_instance("model", model, BeliefModel), FlatEncoder(model)
         self.keys, self.num_features, self.dtype = self._flat.keys, self._flat.num_features, model.dtype
-        self.num_marks = model.num_agents * (1 + model.num_agent_controls)
+        self.num_own, self.num_marks = 0, model.num_agents * (1 + model.num_agent_controls)
 
     def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
         """See :class:`Encoder`."""
         return self._flat.encode_rows(y, rows)
+
+    def own_features(self, y: TensorDictBase) -> Tensor:
+        """None."""
+        return torch.empty(y.batch_size[0], self.model.num_agents, 0, dtype=self.dtype, device=y.device)
 
     def own_marks(self, y: TensorDictBase) -> Tensor:
         """The number of the agent."""
@@ -106,6 +116,8 @@ class AgentNetwork(LocalNetwork):
     """
 
     out_keys = ["logits", "action"]
+    own: nn.Parameter
+    marks: nn.Parameter
 
     def __init__(self, encoder: AgentEncoder, hidden: Sequence[int] = (256, 64), *, generator: torch.Generator) -> None:
         model = check_instance("encoder", encoder, AgentEncoder).model
@@ -114,9 +126,10 @@ class AgentNetwork(LocalNetwork):
             raise ValueError("hidden must hold at least one size, got none")
         super().__init__(encoder, [*sizes, model.num_agent_controls], generator)
         self.in_keys = list(encoder.keys)
-        bound = (encoder.num_features + encoder.num_marks) ** -0.5
-        marks = torch.empty(encoder.num_marks, sizes[0], dtype=encoder.dtype, device=generator.device)
-        self.marks = nn.Parameter(nn.init.uniform_(marks, -bound, bound, generator=generator))
+        bound = (encoder.num_features + encoder.num_own + encoder.num_marks) ** -0.5
+        for name, count in (("own", encoder.num_own), ("marks", encoder.num_marks)):
+            weight = torch.empty(count, sizes[0], dtype=encoder.dtype, device=generator.device)
+            self.register_parameter(name, nn.Parameter(nn.init.uniform_(weight, -bound, bound, generator=generator)))
 
     @property
     def model(self) -> BeliefModel:
@@ -143,9 +156,14 @@ class AgentNetwork(LocalNetwork):
         return tensordict.update(entries.reshape(tensordict.batch_size))
 
     def _first(self, y: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """What the first layer makes of the state ``[N, H]``, and legal controls ``[N, R, A]``."""
-        features = self.encoder.encode_rows(y, None)
-        return rowwise(cast(RowLinear, self.network[0]), features), self.model.agent_mask(y)
+        """What the first layer makes of the state and of each agent's own ``[N, R, H]``, and legal controls ``[N, R, A]``."""
+        encoder = cast(AgentEncoder, self.encoder)
+        hidden = rowwise(cast(RowLinear, self.network[0]), encoder.encode_rows(y, None)).unsqueeze(1)
+        hidden = hidden + self._weights(encoder.own_marks(y))
+        if encoder.num_own:
+            own = encoder.own_features(y)
+            hidden = hidden + product(own.flatten(0, 1), self.own).view(*own.shape[:-1], -1)
+        return hidden, self.model.agent_mask(y)
 
     def _rest(self, hidden: Tensor, mask: Tensor) -> Tensor:
         """Logits ``[M, A]`` of what the first layer gives, ``[M, H]``."""
@@ -163,14 +181,15 @@ class AgentNetwork(LocalNetwork):
     def _decide(self, y: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Logits ``[N, R, A]`` and controls ``[N, R]``, one agent after the other."""
         encoder = cast(AgentEncoder, self.encoder)
-        (hidden, mask), own = self._first(y), encoder.own_marks(y)
+        hidden, mask = self._first(y)
+        earlier = torch.zeros_like(hidden[:, 0])
         logits: list[Tensor] = []
         controls: list[Tensor] = []
         for agent in range(self.model.num_agents):
-            logits.append(self._rest(hidden + self._weights(own[:, agent]), mask[:, agent]))
+            logits.append(self._rest(hidden[:, agent] + earlier, mask[:, agent]))
             controls.append(logits[-1].argmax(-1))
             choice = encoder.choice_marks(y, slice(agent, agent + 1), controls[-1].unsqueeze(-1))
-            hidden = hidden + self._weights(choice.squeeze(1))
+            earlier = earlier + self._weights(choice.squeeze(1))
         return torch.stack(logits, 1), torch.stack(controls, 1)
 
     def _taught(self, y: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -179,6 +198,5 @@ class AgentNetwork(LocalNetwork):
         hidden, mask = self._first(y)
         choices = self._weights(encoder.choice_marks(y, slice(None), told))
         earlier = choices.cumsum(1) - choices
-        hidden = hidden.unsqueeze(1) + self._weights(encoder.own_marks(y)) + earlier
-        logits = self._rest(hidden.flatten(0, 1), mask.flatten(0, 1)).view(mask.shape)
+        logits = self._rest((hidden + earlier).flatten(0, 1), mask.flatten(0, 1)).view(mask.shape)
         return logits, logits.argmax(-1)

@@ -13,7 +13,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-__all__ = ["RowLinear", "affine", "align", "align_terms", "rowwise"]
+__all__ = ["RowLinear", "affine", "align", "align_terms", "product", "rowwise"]
 
 _SIZE, _LENGTH = 16, 4
 # Double precision sums of more terms are shared out among threads, as many of them as there are.
@@ -72,6 +72,15 @@ class RowLinear(nn.Linear):
         x = _padded(input, (0, wide))
         weight, bias = _padded(self.weight, (0, wide, 0, high)), _padded(self.bias, (0, high))
         return affine(x, weight.T, bias)[:, : self.out_features]
+
+
+def product(x: Tensor, weight: Tensor) -> Tensor:
+    """``x @ weight`` ``[M, N]`` of ``[M, K]`` and ``[K, N]``: a row's product does not depend on M."""
+    rows, columns = align(x.shape[0]) - x.shape[0], align(weight.shape[1]) - weight.shape[1]
+    terms = align_terms(x.shape[1]) - x.shape[1]
+    x, weight = _padded(x, (0, terms, 0, rows)), _padded(weight, (0, columns, 0, terms))
+    result = affine(x, weight, weight.new_zeros(weight.shape[1]))
+    return result[: result.shape[0] - rows, : result.shape[1] - columns]
 
 
 def rowwise(network: nn.Module, features: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -140,13 +140,21 @@ def _preset(
     start: Callable[[RepairModel], StateGenerator] = CalibratedStart,
     *,
     repair_probability: float = 1.0,
+    uneven: bool = False,
     name: str,
     device: torch.device,
 ) -> Problem:
+    chain, costs = damage_chain(DEGRADATION), torch.tensor(COSTS)
+    if uneven:
+        # Every third location fails three times as fast, every fourth costs four times as much.
+        place = torch.arange(graph.num_locations)
+        fast = damage_chain([3 * rate for rate in DEGRADATION])
+        chain = torch.where((place % 3 == 1).view(-1, 1, 1), fast, chain)
+        costs = torch.where((place % 4 == 2).view(-1, 1), 4 * costs, costs)
     return repair_problem(
         graph,
-        damage_chain(DEGRADATION),
-        torch.tensor(COSTS),
+        chain,
+        costs,
         DISCOUNT,
         num_robots=num_robots,
         repair_probability=repair_probability,
@@ -190,7 +198,7 @@ def _network32(num_robots: int, *, name: str, device: torch.device) -> Problem:
         device=device,
     )
     # What they add where a simulation is cut.
-    return replace(problem, pessimistic_cost=SteadyStateCost(problem.model))
+    return replace(problem, pessimistic_cost=SteadyStateCost(cast(RepairModel, problem.model)))
 
 
 def _edges(edges: Any, *, locations: int | None = None, columns: Any = None, rows: Any = None) -> Graph:
@@ -234,7 +242,9 @@ REPAIR_PRESETS: dict[str, Callable[..., Problem]] = {
     "grid6x6": partial(_preset, grid(6, 6)),
     "two_robots20": partial(_preset, line(20), 2),
     "grid6x6_obstacles": partial(_preset, grid(6, 6, _OBSTACLES)),
+    "linear20_uneven": partial(_preset, line(20), uneven=True),
     "linear20_slow_repair": partial(_preset, line(20), repair_probability=0.4),
     **{f"network32x{robots}": partial(_network32, robots) for robots in (4, 8, 10)},
 }
-"""The paper's problems by name; those of its follow-up with a number of robots; and its extensions: obstacles, slow repairs."""
+"""The paper's problems by name; those of its follow-up with a number of robots; and its extensions: obstacles, slow repairs,
+locations of several kinds."""

@@ -326,7 +326,7 @@ def _parse_policy(problem: Problem, config: PolicyIterationConfig, tensors: Any)
     if is_multiagent(problem, config):
         encoder = make_agent_encoder(problem, config)
         sizes = [encoder.num_features, *config.hidden, model.num_agent_controls]
-        more = {"marks": (encoder.num_marks, config.hidden[0])}
+        more = {"own": (encoder.num_own, config.hidden[0]), "marks": (encoder.num_marks, config.hidden[0])}
     else:
         sizes, more = [make_encoder(problem, config).num_features, *config.hidden, model.num_controls], {}
     _check_tensors("policies", tensors, parts, sizes, model.dtype, more)

@@ -320,7 +320,7 @@ class PolicyIteration:
         """Collector of the labelled states of a part, all in one batch."""
         config, problem, step = self.config, self.problem, self.plan[index]
         simulation: dict[str, Any] = {
-            "max_steps": config.max_steps,
+            "max_steps": config.label_steps or config.max_steps,
             "truncation": step.truncation,
             "terminal_cost": value,
             "seed": self._seed(number, "labels", part, index),

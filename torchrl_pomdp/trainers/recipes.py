@@ -20,12 +20,20 @@ from typing import Any
 
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.config import PolicyIterationConfig
-from torchrl_pomdp.modules import OnEntering, PartitionedPolicy, Policy, RolloutPolicy, TerminalCost, Truncation
+from torchrl_pomdp.modules import (
+    MultiagentRollout,
+    OnEntering,
+    PartitionedPolicy,
+    Policy,
+    RolloutPolicy,
+    TerminalCost,
+    Truncation,
+)
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.trainers.plan import Evaluate, Improve
 from torchrl_pomdp.trainers.policy_iteration import PolicyIteration
 
-__all__ = ["api", "papi_nt", "papi_t", "r_nt", "r_t"]
+__all__ = ["api", "multiagent_rollouts", "papi_nt", "papi_t", "r_nt", "r_t"]
 
 
 def r_nt(problem: Problem, base_policy: Policy, **options: Any) -> RolloutPolicy:
@@ -45,6 +53,36 @@ def r_nt(problem: Problem, base_policy: Policy, **options: Any) -> RolloutPolicy
         torch.Size([2])
     """
     return RolloutPolicy(check_instance("problem", problem, Problem).model, base_policy, **options)
+
+
+def multiagent_rollouts(
+    problem: Problem, base_policy: Policy, config: PolicyIterationConfig, trajectories: int
+) -> dict[str, MultiagentRollout]:
+    """Multiagent rollout in its schemes, by name, cut as the labels of policy iteration are: online, nothing is learnt.
+
+    Args:
+        problem: the problem.
+        base_policy: the base policy.
+        config: says after how many stages simulations are cut.
+        trajectories: simulated trajectories of each control.
+
+    Examples:
+        >>> from torchrl_pomdp.config import PolicyIterationConfig
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> from torchrl_pomdp.modules.repair import GreedyRepair
+        >>> problem = make_problem("two_robots20")
+        >>> list(multiagent_rollouts(problem, GreedyRepair(problem.model), PolicyIterationConfig(label_steps=10), 2))
+        ['one-at-a-time', 'order-optimised', 'autonomous']
+    """
+    check_instance("problem", problem, Problem)
+    steps = check_instance("config", config, PolicyIterationConfig).label_steps
+    options: dict[str, Any] = {"trajectories": trajectories, "max_steps": steps, "terminal_cost": problem.pessimistic_cost}
+    schemes: dict[str, Any] = {
+        "one-at-a-time": "one_at_a_time",
+        "order-optimised": "order_optimised",
+        "autonomous": "autonomous",
+    }
+    return {name: MultiagentRollout(problem.model, base_policy, scheme=scheme, **options) for name, scheme in schemes.items()}
 
 
 def r_t(problem: Problem, base_policy: Policy, terminal_cost: TerminalCost, **options: Any) -> PartitionedPolicy:
@@ -143,24 +181,13 @@ def _cut_stages(problem: Problem, algorithm: str) -> list[tuple[tuple[int, ...],
     return [(stage, OnEntering(parts) if parts else None) for stage, parts in zip(stages, earlier, strict=True)]
 
 
-def api(
-    problem: Problem,
-    config: PolicyIterationConfig,
-    base_policy: Policy,
-    *,
-    truncation: Truncation | None = None,
-    **options: Any,
-) -> PolicyIteration:
+def api(problem: Problem, config: PolicyIterationConfig, base_policy: Policy, **options: Any) -> PolicyIteration:
     """Policy iteration with one network for the whole feature space; the problem must have a single part.
 
     Args:
         problem: the problem, such as :meth:`Problem.unpartitioned` of another.
         config: the numbers; ``samples_per_part`` is then the number of all samples.
         base_policy: the policy that is improved first.
-
-    Keyword Args:
-        truncation: rule that cuts the simulations, such as :class:`~torchrl_pomdp.modules.AfterSteps`; what is added is the
-            problem's pessimistic cost. None: no truncation.
         options: see :class:`PolicyIteration`.
 
     Raises:
@@ -176,4 +203,4 @@ def api(
     parts = check_instance("problem", problem, Problem).partition.num_parts
     if parts != 1:
         raise ValueError(f"API is for a problem with a single part, {problem.name!r} has {parts}: take problem.unpartitioned()")
-    return PolicyIteration(problem, config, base_policy, [Improve((0,), truncation)], **options)
+    return PolicyIteration(problem, config, base_policy, [Improve((0,))], **options)

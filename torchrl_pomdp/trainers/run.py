@@ -23,9 +23,10 @@ from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import PartitionedValue, Policy
 from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.trainers.architecture import is_multiagent
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
-from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt, r_t
+from torchrl_pomdp.trainers.recipes import api, multiagent_rollouts, papi_nt, papi_t, r_nt, r_t
 
 __all__ = ["ALGORITHMS", "TrainingRun"]
 
@@ -168,13 +169,27 @@ class _Execution:
         for name, policy in bases.items():
             self._compare(name, policy, run.states)
         base = bases[run.base]
-        self._compare(f"R-NT of {self.run.base}", r_nt(self.problem, base, trajectories=run.online_trajectories), run.states)
+        for name, online in self._online(base).items():
+            self._compare(f"{name} of {self.run.base}", online, run.states)
         best, policy = self._train(base)
         if run.online_states:
-            online = r_nt(self.problem, policy, trajectories=run.online_trajectories)
-            self._compare(f"{best} + R-NT", online, run.online_states)
+            # The first one: what the networks have been taught.
+            name, online = next(iter(self._online(policy).items()))
+            self._compare(f"{best} + {name}", online, run.online_states)
         self.check_folder()
         return self.results
+
+    def _online(self, policy: TensorDictModuleBase) -> dict[str, Policy]:
+        """Online rollouts of a policy by name; first the one that makes the labels."""
+        run, problem = self.run, self.problem
+        several = is_multiagent(problem, run.config)
+        found: dict[str, Policy] = {}
+        if several:
+            found |= multiagent_rollouts(problem, policy, run.config, run.online_trajectories)
+        if problem.model.enumerable:
+            cut = {"max_steps": run.config.label_steps, "terminal_cost": problem.pessimistic_cost} if several else {}
+            found["R-NT"] = r_nt(problem, policy, trajectories=run.online_trajectories, **cut)
+        return found
 
     def _train(self, base: TensorDictModuleBase) -> tuple[str, TensorDictModuleBase]:
         """Carry out the iterations, keep and evaluate their policies; name and policy of the best one."""

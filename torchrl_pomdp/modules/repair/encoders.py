@@ -11,17 +11,21 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from torchrl_pomdp.checks import check_instance
+from torchrl_pomdp.envs.repair.chains import location_costs, prices
 from torchrl_pomdp.envs.repair.graphs import Graph
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
+from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.agents import AgentEncoder
 from torchrl_pomdp.modules.encoders import Encoder, transformed
-from torchrl_pomdp.modules.rowwise import affine, align, align_terms
+from torchrl_pomdp.modules.rowwise import affine, align, align_terms, product
 
 __all__ = ["RelativeEncoder", "RobotEncoder"]
 
 
 # Offsets that differ by less than this fraction of the graph's size are the same: coordinates are rounded.
 _SAME = 1e-5
+# Powers of the nearness by which a robot weighs what is far away.
+_POWERS = 3
 # Most features of a window: a first layer of a hundred million weights.
 _MOST_FEATURES = 1 << 19
 
@@ -206,10 +210,18 @@ def _ranks(values: Tensor, rounding: float) -> Tensor:
 
 
 class RobotEncoder(AgentEncoder):
-    """What a robot among many sees: beliefs, where all robots are, where it is itself, and where earlier ones go or repair.
+    r"""What a robot among many sees: what is known of all locations, where the damage lies from where it stands, who else does
+    what.
 
-    Features are those of :class:`RelativeEncoder` by location, what is known of each, then how many robots are there. Marks are
-    the robot's number and location, and of earlier robots the locations that they go to or repair.
+    Features of the state are, for every location, whether damage is possible, the probabilities of the damaged levels, and how
+    many robots are there. A robot's own features say for each of its controls how much damage lies that way, near or far:
+    with :math:`c_l` the extra cost of location l, d the way to it and the sum over the locations that a shortest path through
+    the control leads to,
+
+    .. math:: \log\Bigl(1+\sum_l c_l\,(d+1)^{-p}\Bigr),\qquad \log\Bigl(1+\sum_l c_l\,(d+1)^{-p}/n_l\Bigr),
+
+    p = 1, 2, 3, where :math:`n_l=\sum_r(d_r+1)^{-3}` counts the robots near l. Marks are the robot's number and location, and
+    of earlier robots the locations that they go to or repair.
 
     Args:
         model: the repair model.
@@ -217,24 +229,35 @@ class RobotEncoder(AgentEncoder):
     Examples:
         >>> from torchrl_pomdp.problems import make_problem
         >>> encoder = RobotEncoder(make_problem("network32x10").model)
-        >>> encoder.num_features, encoder.num_marks
-        (192, 106)
+        >>> encoder.num_features, encoder.num_own, encoder.num_marks
+        (192, 30, 106)
     """
 
     keys = ("belief", "location")
     model: RepairModel
+    ways: Tensor
+    nearness: Tensor
 
     def __init__(self, model: RepairModel) -> None:
         super().__init__()
         self.model = check_instance("model", model, RepairModel)
         self.dtype = model.dtype
-        size = model.num_locations
+        size, count = model.num_locations, model.num_robot_controls
         self.num_features, self.num_marks = size * (model.num_levels + 1), model.num_robots + 3 * size
+        self.num_own = 2 * _POWERS * count
+        self._prices = prices(model.costs - model.costs[..., :1])
+        near = (model.graph.distances.to(model.device, model.dtype) + 1.0).reciprocal()
+        powers = torch.stack([near**power for power in range(1, _POWERS + 1)], -1)
+        first = torch.nn.functional.one_hot(model.first_controls, count).to(model.dtype)
+        # [L, L * A * P]: what a location's cost is to a robot at every location, by its controls and the powers.
+        ways = (first.unsqueeze(-1) * powers.unsqueeze(-2)).flatten(2)
+        self.register_buffer("ways", ways.transpose(0, 1).flatten(1).contiguous(), persistent=False)
+        self.register_buffer("nearness", powers[..., -1].contiguous(), persistent=False)
 
     def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:
         """See :class:`~torchrl_pomdp.modules.Encoder`."""
         belief, location = y.get("belief"), y.get("location")
-        # A transposition of two dimensions is much faster than a general permutation.
+        # A transposition of two dimensions is much faster than a general permutation; what is written into is a copy.
         planes = belief.permute(1, 2, 0).flatten(0, 1)
         known = planes.T.clone(memory_format=torch.contiguous_format)
         known[:, :: self.model.num_levels] = 1.0 - known[:, :: self.model.num_levels].floor()
@@ -242,6 +265,17 @@ class RobotEncoder(AgentEncoder):
         robots.scatter_add_(1, location, torch.ones_like(location, dtype=self.dtype))
         features = torch.cat([known, robots], -1)
         return features if rows is None else features.index_select(0, rows)
+
+    def own_features(self, y: TensorDictBase) -> Tensor:
+        """How much damage lies each way; see the class."""
+        belief, location = y.get("belief"), y.get("location")
+        costs = location_costs(belief.permute(1, 2, 0), self._prices).T.clamp_min(0.0)
+        robots = self.nearness.index_select(0, location.T.flatten()).view(*location.T.shape, -1)
+        shared = costs / sum_first(robots.clone())
+        place = location.unsqueeze(-1).expand(-1, -1, self.num_own // 2)
+        shape = len(location), self.model.num_locations, self.num_own // 2
+        seen = [product(each.contiguous(), self.ways).view(shape) for each in (costs, shared)]
+        return torch.cat([each.gather(1, place) for each in seen], -1).clamp_min(0.0).log1p()
 
     def own_marks(self, y: TensorDictBase) -> Tensor:
         """The robot's number, and its location."""
