@@ -345,6 +345,17 @@ MODULES = {
         modules.MultiagentRollout(model(), greedy()), (state(), states(state()))
     ),
     "modules.FlatAgentEncoder": lambda _: case(modules.FlatAgentEncoder, model=belief_model()),
+    "modules.repair.OldPolicy": lambda _: case(
+        repair_modules.OldPolicy, lambda made: made(repair.UniformStart(model(), (0,))(torch.arange(2))),
+        policy=(greedy(), not_callable()),
+        old=(two_robots(), objects(RepairModel)),
+        new=repair_model(),
+        lost=(1, [wrong for wrong in integers(0, 1) if wrong.value is not None]),
+        place=(1, integers(0, 2)),
+    ),
+    "modules.repair.OldPolicy.forward": lambda _: on_entries(
+        repair_modules.OldPolicy(greedy(), model(), model()), "belief", "location"
+    ),
     "modules.repair.RobotEncoder": lambda _: case(repair_modules.RobotEncoder, model=repair_model()),
     "modules.AgentNetwork": lambda _: case(
         modules.AgentNetwork,

@@ -9,9 +9,7 @@ import pytest
 
 from torchrl_pomdp.config import PolicyIterationConfig
 
-NUMBERS = [
-    f.name for f in fields(PolicyIterationConfig) if isinstance(f.default, (int, float)) and not isinstance(f.default, bool)
-]
+NUMBERS = [f.name for f in fields(PolicyIterationConfig) if type(f.default) in (int, float)]
 COUNTS = [f.name for f in fields(PolicyIterationConfig) if type(f.default) is int and f.name != "seed"]
 
 

@@ -6,11 +6,20 @@ from typing import Any, cast
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.modules.repair.base_policies import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.modules.repair.changed import OldPolicy
 from torchrl_pomdp.modules.repair.encoders import RelativeEncoder, RobotEncoder
 from torchrl_pomdp.modules.repair.terminal_costs import NeverRepairCost, SteadyStateCost
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, offer_engines
 
-__all__ = ["GreedyRepair", "NeverRepairCost", "RelativeEncoder", "RobotEncoder", "SteadyStateCost", "UrgencyRepair"]
+__all__ = [
+    "GreedyRepair",
+    "NeverRepairCost",
+    "OldPolicy",
+    "RelativeEncoder",
+    "RobotEncoder",
+    "SteadyStateCost",
+    "UrgencyRepair",
+]
 
 
 def _local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -> SearchEngine | None:
