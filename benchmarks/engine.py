@@ -169,11 +169,16 @@ from pathlib import Path
 from benchmarks.setting import by_tensors, line_problem
 from torchrl_pomdp.modules import TruncatedRollout, ZeroCost
 from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.problems import make_problem
 torch.set_num_threads(1)
 # The peak of this program alone; what `resource` tells includes that of the one which has started it.
 peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
 rows, steps = int(sys.argv[1]), int(sys.argv[2])
-model, start = line_problem(20, drift=0.01)
+if sys.argv[3] == "line":
+    model, start = line_problem(20, drift=0.01)
+else:
+    problem = make_problem(sys.argv[3])
+    model, start = problem.model, problem.start
 keys = torch.arange(rows)
 # Few different states, so that making them takes no memory to speak of.
 y = start(torch.arange(1024))[keys % 1024]
@@ -187,15 +192,18 @@ print((peak() - before) * 1024)
 
 def memory(table: Table) -> None:
     """Peak memory of a rollout for each live row, in processes of their own; it must not grow with the length."""
+    for steps in (20, 80):
+        table.add(f"memory for each live row, {steps} steps", row_memory("line", 131_072, steps), "bytes", "<= 4096")
 
-    def peak(rows: int, steps: int) -> int:
-        command = [sys.executable, "-c", _MEMORY, str(rows), str(steps)]
+
+def row_memory(problem: str, rows: int, steps: int) -> float:
+    """Bytes of peak memory for each live row of a rollout by tensors: what twice as many rows take more."""
+
+    def peak(rows: int) -> int:
+        command = [sys.executable, "-c", _MEMORY, str(rows), str(steps), problem]
         return int(subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[1]).stdout)
 
-    few, many = 131_072, 262_144
-    for steps in (20, 80):
-        per_row = (peak(many, steps) - peak(few, steps)) / (many - few)
-        table.add(f"memory for each live row, {steps} steps", per_row, "bytes", "<= 4096")
+    return (peak(2 * rows) - peak(rows)) / rows
 
 
 def env_step(table: Table) -> None:

@@ -61,7 +61,7 @@ def _change(problem: Problem, *, lost: int | None = None, place: int = 0, **chan
     new = repair_problem(
         **arguments, num_robots=robots, start=lambda model: CalibratedStart(model, fraction), name=f"changed {problem.name}"
     )
-    new = replace(new, pessimistic_cost=type(problem.pessimistic_cost)(new.model))  # type: ignore[call-arg]
+    new = replace(new, pessimistic_cost=type(problem.pessimistic_cost)(new.model))
     policy = OldPolicy(problem.base_policies["urgency"], old, cast(RepairModel, new.model), lost, place)
     return Change(new, policy)
 
@@ -99,10 +99,8 @@ def measure_changes(
         problem, old = change.problem, change.policy
         # Many robots: simulations are cut, as their labels are.
         many = not problem.model.enumerable
-        kind, cut = (
-            (MultiagentRollout, {"max_steps": 10, "terminal_cost": problem.pessimistic_cost}) if many else (RolloutPolicy, {})
-        )
-        online = cast(Any, kind)(problem.model, old, trajectories=trajectories, **cut)
+        cut: dict[str, Any] = {"max_steps": 10, "terminal_cost": problem.pessimistic_cost} if many else {}
+        online = (MultiagentRollout if many else RolloutPolicy)(problem.model, old, trajectories=trajectories, **cut)
         policies = {"old policy": old, "rollout of it": online, "made anew": problem.base_policies["urgency"]}
         costs: dict[str, torch.Tensor] = {}
         found[name] = {}

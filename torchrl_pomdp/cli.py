@@ -146,6 +146,20 @@ class Reproduce:
 
 
 @dataclass(frozen=True)
+class Changes:
+    """Measure what online rollout gains where the model has changed under an old policy, without training."""
+
+    states: int = 1000
+    """Start states."""
+
+    trajectories: int = 10
+    """Simulated trajectories of each control."""
+
+    out: Path = Path("results")
+    """Folder of the table."""
+
+
+@dataclass(frozen=True)
 class Problems:
     """List the known problems with their numbers of states, controls and observations."""
 
@@ -159,10 +173,11 @@ def main(args: list[str] | None = None) -> int:
         Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Compare, tyro.conf.subcommand("compare")]
+        | Annotated[Changes, tyro.conf.subcommand("changes")]
         | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
         | Annotated[Problems, tyro.conf.subcommand("problems")]
     )
-    command: Train | Evaluate | Compare | Reproduce | Problems = tyro.cli(choices, prog="torchrl-pomdp", args=args)
+    command: Train | Evaluate | Compare | Changes | Reproduce | Problems = tyro.cli(choices, prog="torchrl-pomdp", args=args)
     from torchrl import logger
 
     from torchrl_pomdp import commands
@@ -175,6 +190,8 @@ def main(args: list[str] | None = None) -> int:
             commands.evaluate(command)
         elif isinstance(command, Compare):
             commands.compare(command)
+        elif isinstance(command, Changes):
+            commands.changes(command)
         elif isinstance(command, Reproduce):
             commands.reproduce(command)
         else:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from torchrl_pomdp.changes import measure_changes
 from torchrl_pomdp.checks import check_integer, check_seed
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
 from torchrl_pomdp.envs import BeliefEnv
@@ -32,9 +33,9 @@ from torchrl_pomdp.trainers.run import TrainingRun
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from torchrl_pomdp.cli import Compare, Evaluate, Reproduce, Train
+    from torchrl_pomdp.cli import Changes, Compare, Evaluate, Reproduce, Train
 
-__all__ = ["compare", "evaluate", "problems", "reproduce", "train"]
+__all__ = ["changes", "compare", "evaluate", "problems", "reproduce", "train"]
 
 
 def train(command: Train) -> None:
@@ -145,6 +146,25 @@ def compare(command: Compare) -> None:
     title = f"{problem.name}, {command.states} start states"
     pictures = {out / f"{name}-time.png": partial(peer_figure, outcomes, title)}
     print(draw(pictures | {out / f"{name}.png": partial(cost_figure, results, f"{title}\nbelow: against {problem.baseline}")}))
+
+
+def changes(command: Changes) -> None:
+    """Measure all changes of models; print the table and write it."""
+    out = check_folder("out", command.out)
+    found = measure_changes(
+        command.states,
+        trajectories=command.trajectories,
+        report=lambda change, policy, comparison: _tell("the old policy", f"{change}, {policy}", comparison),
+        progress=True,
+    )
+    tables = [
+        f"{change}, {command.states} start states, ratios to the old policy\n\n"
+        + table([Result(policy, comparison) for policy, comparison in policies.items()])
+        for change, policies in found.items()
+    ]
+    text = "\n\n".join(tables)
+    write_bytes(out / "model-changes.md", f"{text}\n".encode())
+    print(f"\n{text}\n", flush=True)
 
 
 def _simulated_steps(folder: Path) -> int | None:

@@ -124,6 +124,12 @@ def repair_models():
     yield pytest.param(
         RepairModel(line(3), chains[0], [0.0, 1.0, 5.0], 0.9, dtype=torch.float64).unrestricted(), id="unrestricted"
     )
+    # Locations of many kinds, intact ones that cost something, repairs that may fail.
+    own = torch.stack([damage_chain((0.0, rate)) for rate in (0.1, 0.3, 0.5, 0.7)])
+    prices = torch.tensor([[0.5, 1.0, 5.0]]) * torch.tensor([[1.0], [2.0], [1.0], [0.5]])
+    yield pytest.param(
+        RepairModel(line(4), own, prices, 0.9, repair_probability=0.4, dtype=torch.float64), id="many kinds, failing repairs"
+    )
 
 
 def tabular_models():
@@ -174,6 +180,10 @@ def watched(engine, y, number, controls, count):
 def test_no_policy_costs_less_than_the_relaxation_in_any_scenario(model):
     generator = torch.Generator().manual_seed(1)
     y = make_states(model, 12, generator)
+    if isinstance(model, RepairModel):
+        # Damage where the first robot stands, and nowhere else: what follows its repair costs what intact locations do.
+        y["belief"][0] = torch.eye(model.num_levels, dtype=model.dtype)[0]
+        y["belief"][0, y["location"][0, 0]] = torch.eye(model.num_levels, dtype=model.dtype)[1]
     every, _ = engines(model)
     nontrivial = 0
     for engine in every:

@@ -40,6 +40,7 @@ class Myopic(TensorDictModuleBase):
     def __init__(self, model: BeliefModel) -> None:
         super().__init__()
         self.model = check_instance("model", model, BeliefModel)
+        model.check_enumerable("Myopic", "a policy that chooses for each agent")
         self.in_keys = list(model.state_keys)
 
     def scalar_engine(self, model: BeliefModel, limits: Limited) -> SearchEngine | None:

@@ -107,6 +107,7 @@ class TreeSearch(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.model = check_instance("model", model, BeliefModel)
+        model.check_enumerable(type(self).__name__, "MultiagentRollout")
         self.in_keys = list(model.state_keys)
         self.base_policy = None if base_policy is None else check_callable("base_policy", base_policy)
         self.budget = Budget(simulations, seconds)

@@ -65,7 +65,7 @@ def check_belief_model(model: BeliefModel, generator: StateGenerator, *, seed: i
         >>> problem = tiger()
         >>> check_belief_model(problem.model, problem.start)
     """
-    check_instance("model", model, BeliefModel)
+    check_instance("model", model, BeliefModel).check_enumerable("check_belief_model", "the same model with fewer agents")
     check_callable("generator", generator)
     seed = check_integer("seed", seed)
     with torch.no_grad():
