@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from _hostile import choices, flags, integers, mappings, numbers, objects, paths, policies, sequences, values
 from _valid import a_problem, belief_model, callback, case, state
 
-from torchrl_pomdp import planners, report, trainers
+from torchrl_pomdp import changes, planners, report, trainers
 from torchrl_pomdp.evaluation import compare
 
 __all__ = ["PEERS"]
@@ -14,6 +15,13 @@ __all__ = ["PEERS"]
 # fmt: off
 
 TITLES = values(None, 3, b"x", [], object())
+
+
+def few_changes(*args, **options):
+    """Nothing has changed: what is refused is refused before."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(changes, "model_changes", dict)
+        return changes.measure_changes(*args, **options)
 
 
 def outcome():
@@ -68,6 +76,13 @@ PEERS = {
         report.peer_figure,
         outcomes=({"a": outcome()}, [*mappings(), *values({"a": 3}, {"a": None}, {})]),
         title=("title", TITLES),
+    ),
+    "changes.measure_changes": lambda _: case(
+        few_changes,
+        states=(2, integers(2)),
+        trajectories=(1, integers(1)),
+        report=callback(),
+        progress=(False, flags()),
     ),
     "trainers.compare_peers": lambda folder: case(
         trainers.compare_peers,

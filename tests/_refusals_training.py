@@ -154,6 +154,7 @@ TRAINERS = {
         visits_per_label=(0.5, numbers("(0, inf)")),
         learning_rate=(0.5, numbers("(0, inf)")),
         symmetries=(True, flags()),
+        label_steps=(5, [wrong for wrong in integers(1) if wrong.value is not None]),
         multiagent=(False, flags()),
         hidden=((4,), sizes()),
         value_hidden=((4,), sizes()),

@@ -42,7 +42,7 @@ PUBLIC = (
     *("envs", "envs.repair", "modules", "modules.repair", "problems"),
     *("collectors", "objectives", "trainers", "trainers.run"),
     *("controller", "evaluation", "noise", "report", "reproduce", "files", "checks", "tensor_checks", "identity"),
-    *("planners", "bounds"),
+    *("planners", "bounds", "changes"),
 )
 
 # What is not tried, and why.
@@ -52,9 +52,10 @@ EXEMPT = {
     "abstract, tried by what they are bases of": "envs.Partition modules.Encoder modules.AgentEncoder modules.ClosedFormCost "
     "modules.Truncation",
     "made by the library, not by its users": "*.Comparison *.Estimate *.Iteration *.PartRecord *.Effort *.DamagedFileError "
-    "*.PartitionReport *.Decision *.Interval *.Solution *.ErrorBounds",
+    "*.PartitionReport *.Change *.Decision *.Interval *.Solution *.ErrorBounds",
     "run at every belief step, on what was checked before": "noise.fold noise.uniform noise.fingerprint noise.permuted",
     "of any object": "identity.*",
+    "of no argument": "changes.model_changes",
 }
 
 LIMIT_SECONDS = 2.0

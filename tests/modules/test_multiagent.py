@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import product
 
 import pytest
@@ -12,10 +13,11 @@ from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, grid, line
 from torchrl_pomdp.envs.repair.tabular import joint_belief, tabular_model
 from torchrl_pomdp.evaluation import compare, discounted_costs
-from torchrl_pomdp.modules import MultiagentRollout, MultistepLookahead, RolloutPolicy
+from torchrl_pomdp.modules import MultiagentRollout, MultistepLookahead, Myopic, RolloutPolicy
 from torchrl_pomdp.modules.repair import GreedyRepair, SteadyStateCost, UrgencyRepair
-from torchrl_pomdp.planners import solve
-from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.planners import DESPOT, POMCP, solve
+from torchrl_pomdp.problems import check_belief_model, make_problem
+from torchrl_pomdp.trainers import ppo
 
 SCHEMES = ("one_at_a_time", "order_optimised", "autonomous")
 
@@ -165,9 +167,18 @@ def test_too_many_joint_controls_are_never_enumerated():
     assert not model.enumerable
     assert model.num_controls == 5**10
     base = GreedyRepair(model)
-    for component in (RolloutPolicy,):
-        with pytest.raises(ValueError, match=r"5\^10 = 9765625: use MultiagentRollout"):
-            component(model, base)
+    for component in (
+        partial(RolloutPolicy, model, base),
+        partial(POMCP, model, base, simulations=1),
+        partial(DESPOT, model, base, simulations=1),
+        partial(Myopic, model),
+        partial(check_belief_model, model, problem.start),
+        partial(ppo, problem, steps=4096),
+    ):
+        with pytest.raises(ValueError, match=r"which goes through them all, got 5\^10 = 9765625: use "):
+            component()
+    with pytest.raises(ValueError, match="model must have at most 131072 joint states"):
+        tabular_model(model)
     y = model.with_features(problem.start(torch.arange(3)))
     with pytest.raises(ValueError, match=r"num_observations must be at most 4096"):
         model.observation_probs(y, base(y.clone())["action"])

@@ -86,6 +86,7 @@ def ppo(problem: Problem, *, steps: int, seed: int = 0, progress: bool = False) 
         torch.Size([100])
     """
     problem = check_instance("problem", problem, Problem).unpartitioned()
+    problem.model.check_enumerable("ppo", "trainers.api, whose network agents share")
     steps, seed = check_integer("steps", steps, BATCH, _MOST), check_seed("seed", seed)
     batches = steps // BATCH
     bar = progress_bar(batches * BATCH, "step", "PPO", check_flag("progress", progress))
