@@ -52,6 +52,8 @@ def r_nt(problem: Problem, base_policy: Policy, **options: Any) -> RolloutPolicy
         >>> r_nt(problem, GreedyRepair(problem.model))(problem.start(torch.arange(2)))["action"].shape
         torch.Size([2])
     """
+    if not problem.model.enumerable:
+        del schemes["order-optimised"]
     return RolloutPolicy(check_instance("problem", problem, Problem).model, base_policy, **options)
 
 
@@ -59,6 +61,8 @@ def multiagent_rollouts(
     problem: Problem, base_policy: Policy, config: PolicyIterationConfig, trajectories: int
 ) -> dict[str, MultiagentRollout]:
     """Multiagent rollout in its schemes, by name, cut as the labels of policy iteration are: online, nothing is learnt.
+
+    The best order takes R(R+1)/2·A Q-factors: it is left out where there are too many joint controls.
 
     Args:
         problem: the problem.
