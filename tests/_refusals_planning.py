@@ -87,6 +87,9 @@ BELIEF = torch.full((2,), 0.5)
 STAY = torch.eye(2).repeat(3, 1, 1)
 HEAR = torch.full((3, 2, 4), 0.25)
 
+# A robot of two is lost.
+TWO, ONE = (RepairModel(repair.line(2), CHAIN, COSTS, 0.9, num_robots=robots) for robots in (2, 1))
+
 
 def play(of):
     """Use a model."""
@@ -346,12 +349,12 @@ MODULES = {
     ),
     "modules.FlatAgentEncoder": lambda _: case(modules.FlatAgentEncoder, model=belief_model()),
     "modules.repair.OldPolicy": lambda _: case(
-        repair_modules.OldPolicy, lambda made: made(repair.UniformStart(model(), (0,))(torch.arange(2))),
+        repair_modules.OldPolicy,
         policy=(greedy(), not_callable()),
-        old=(two_robots(), objects(RepairModel)),
-        new=repair_model(),
+        old=(TWO, objects(RepairModel)),
+        new=(ONE, objects(RepairModel, TWO)),
         lost=(1, [wrong for wrong in integers(0, 1) if wrong.value is not None]),
-        place=(1, integers(0, 2)),
+        place=(1, integers(0, 1)),
     ),
     "modules.repair.OldPolicy.forward": lambda _: on_entries(
         repair_modules.OldPolicy(greedy(), model(), model()), "belief", "location"

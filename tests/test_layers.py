@@ -13,7 +13,7 @@ ROOT = Path(torchrl_pomdp.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
 ROOMS = ("torchrl_pomdp.envs.repair", "torchrl_pomdp.modules.repair")
 # The repair problems by name and by file, the paper's experiments, and the command.
-KNOW_PIPELINES = {"problems/repair.py", "reproduce.py", "cli.py", "commands.py"}
+KNOW_PIPELINES = {"problems/repair.py", "reproduce.py", "changes.py", "cli.py", "commands.py"}
 # What must not be imported from where; what lies beside these packages is free.
 ABOVE = {
     "envs": {"modules", "problems", "collectors", "objectives", "planners", "trainers"},

@@ -101,7 +101,8 @@ def test_huge_sizes_are_refused_at_once():
         lambda: grid(10**4, 10**4),
         lambda: Graph.from_edges("huge", 10**9, []),
         lambda: RepairModel(line(2), damage_chain((0.1,)), (0.0, 1.0), 0.9, num_robots=10**12),
-        lambda: RepairModel(line(2), damage_chain((0.1,)), (0.0, 1.0), 0.9, num_robots=14),
+        lambda: RepairModel(line(2), damage_chain((0.1,)), (0.0, 1.0), 0.9, num_robots=17),
+        lambda: RepairModel(line(2), damage_chain((0.1,) * 200), (0.0,) * 201, 0.9, num_robots=16),
         lambda: RandomState(model, max_age=10**12),
         lambda: damage_chain((0.1,) * 10_000),
     ):

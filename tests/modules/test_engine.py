@@ -21,7 +21,7 @@ from torchrl_pomdp.modules import (
     ZeroCost,
 )
 from torchrl_pomdp.modules.compiling import compiled
-from torchrl_pomdp.modules.lookahead import spread
+from torchrl_pomdp.modules.qfactors import spread
 from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.problems import tiger

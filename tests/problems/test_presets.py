@@ -12,6 +12,9 @@ SIZES = {
     "grid5x4": (20 * 5**20, 5, 5, "5 x 4 grid, 1 robot: 1.9e+15 states"),
     "grid6x6": (36 * 5**36, 5, 5, "6 x 6 grid, 1 robot: 5.2e+26 states"),
     "two_robots20": (20**2 * 5**20, 9, 25, "line of 20, 2 robots: 3.8e+16 states"),
+    "linear20_slow_repair": (20 * 5**20, 3, 5, "line of 20, 1 robot: 1.9e+15 states"),
+    "linear20_uneven": (20 * 5**20, 3, 5, "line of 20, 1 robot: 1.9e+15 states"),
+    "grid6x6_obstacles": (30 * 5**30, 5, 5, "6 x 6 grid with 6 obstacles, 1 robot: 2.8e+22 states"),
 }
 # The others: controls, observations, and what their description says.
 OTHERS = {
@@ -20,6 +23,9 @@ OTHERS = {
     "rocksample7x8": (13, 3, "12545 states"),
     "rocksample11x11": (16, 3, "247809 states"),
     "rocksample15x15": (20, 3, "7372801 states"),
+    "network32x4": (5**4, 5**4, "network of 32, 4 robots: 2.4e+28 states"),
+    "network32x8": (5**8, 5**8, "network of 32, 8 robots: 2.6e+34 states"),
+    "network32x10": (5**10, 5**10, "network of 32, 10 robots: 2.6e+37 states"),
     **{f"maintenance{k}": (243, 1024, "MaintenanceModel") for k in range(1, 6)},
 }
 

@@ -159,7 +159,11 @@ def test_what_could_not_be_loaded_is_refused_when_saved(line3, linear20, path):
     infinite.values[2].network[0].bias.data[1] = torch.inf
     steady = PartitionedValue([SteadyStateCost(line3.model)] * 6)
     wrong = [
-        ("must have a PolicyNetwork in every part, got GreedyRepair", PartitionedPolicy([greedy] * 6), value),
+        (
+            "must have a PolicyNetwork or an AgentNetwork in every part, got GreedyRepair",
+            PartitionedPolicy([greedy] * 6),
+            value,
+        ),
         ("or one of greedy, urgency as it is by name, got another GreedyRepair", GreedyRepair(line3.model, 0.3), value),
         ("or one of greedy, urgency as it is by name, got another UrgencyRepair", UrgencyRepair(line3.model, 2.0), value),
         ("could not be loaded again: policies.2.network.0.bias holds numbers that are not finite", nan, value),

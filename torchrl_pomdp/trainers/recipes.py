@@ -52,8 +52,6 @@ def r_nt(problem: Problem, base_policy: Policy, **options: Any) -> RolloutPolicy
         >>> r_nt(problem, GreedyRepair(problem.model))(problem.start(torch.arange(2)))["action"].shape
         torch.Size([2])
     """
-    if not problem.model.enumerable:
-        del schemes["order-optimised"]
     return RolloutPolicy(check_instance("problem", problem, Problem).model, base_policy, **options)
 
 
@@ -86,6 +84,8 @@ def multiagent_rollouts(
         "order-optimised": "order_optimised",
         "autonomous": "autonomous",
     }
+    if not problem.model.enumerable:
+        del schemes["order-optimised"]
     return {name: MultiagentRollout(problem.model, base_policy, scheme=scheme, **options) for name, scheme in schemes.items()}
 
 
