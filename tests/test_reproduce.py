@@ -154,3 +154,19 @@ def test_only_the_experiments_own_problems_can_be_chosen():
     ]
     with pytest.raises(ValueError, match="problems must be among"):
         plan(EXPERIMENTS["table1"], "tuned", "greedy", 0.1, 0, ("linear20",))
+
+
+def test_many_robots_are_taught_one_after_the_other():
+    runs = plan(EXPERIMENTS["multirobot"], "tuned", "greedy", 0.01, 0)
+    assert [run.problem.model.num_robots for run in runs.values()] == [4, 8, 10]
+    for run, steps in zip(runs.values(), (25, 5, 5), strict=True):
+        assert run.config.multiagent
+        assert (run.algorithm, run.config.label_steps) == ("API", steps)
+    published = settings_config("paper", "network32x8", 0.01, 0)
+    assert (published.label_steps, published.iterations, published.trajectories) == (10, 4, 10)
+
+
+def test_extensions_are_run_like_the_papers_problems():
+    runs = plan(EXPERIMENTS["extensions"], "tuned", "urgency", 0.01, 0)
+    assert [run.problem.name for run in runs.values()] == list(EXPERIMENTS["extensions"].problems)
+    assert all(run.algorithm == "pAPI-NT" and not run.config.multiagent for run in runs.values())

@@ -80,8 +80,8 @@ OPTIMA = {"line3": 168.97}
 
 # Labelled states of each part in the paper.
 _SAMPLES = {"linear20": 200_000, "line3": 200_000, "linear20_slow_repair": 200_000, "linear20_uneven": 200_000}
-# Stages of a label's trajectories where there are many robots; 10 in their paper. Discounted by 0.95 fewer will do; where what is
-# repaired stays intact, they need as many as it takes to get to the damage.
+# Stages of a label's trajectories where there are many robots; 10 in their paper. Discounted by 0.95 fewer will do; where
+# repaired locations stay intact, as many as it takes to get to the damage.
 _MANY_ROBOTS = {"network32x4": 25, "network32x8": 5, "network32x10": 5}
 _MORE_SAMPLES = 500_000
 
