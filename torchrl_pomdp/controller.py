@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_mapping, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.lookahead import RolloutPolicy
+from torchrl_pomdp.modules.multiagent import MultiagentRollout
 from torchrl_pomdp.modules.rollout import Policy, controls_of
 
 __all__ = ["Controller", "Decision"]
@@ -99,7 +100,8 @@ class Controller:
         checkpoint = load_checkpoint(path, problem=problem, device=device)
         model, policy = checkpoint.problem.model, checkpoint.policy
         if online:
-            policy = RolloutPolicy(model, policy, terminal_cost=checkpoint.problem.pessimistic_cost)
+            rollout = RolloutPolicy if model.enumerable else MultiagentRollout
+            policy = rollout(model, policy, terminal_cost=checkpoint.problem.pessimistic_cost)
         return cls(model, policy)
 
     # ---- the loop ------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import torch
 from _oracles import random_states, small_model
 from tensordict import TensorDict
 
+from torchrl_pomdp.controller import Controller
 from torchrl_pomdp.envs.repair import line
 from torchrl_pomdp.modules import AgentNetwork, FlatAgentEncoder, MultiagentRollout, PartitionedPolicy
 from torchrl_pomdp.modules.repair import GreedyRepair, RobotEncoder, SteadyStateCost
@@ -152,3 +153,23 @@ def test_a_network_rolls_out():
         problem.model, GreedyRepair(problem.model), scheme="autonomous", signalling=network, **options
     )(y.clone())
     assert found["action"].shape == signalled["action"].shape == (4, 10)
+
+
+def test_many_robots_are_controlled_one_by_one_from_a_file(tmp_path):
+    """What a real team does: named controls out, reported levels in, rollout on top of the network."""
+    problem = make_problem("network32x8")
+    config = PolicyIterationConfig(hidden=(4,))
+    save_checkpoint(
+        tmp_path / "best.pt", Checkpoint(problem, config, "API", 1, make_networks(problem, config, 0), run_value(problem))
+    )
+    controller = Controller.from_checkpoint(tmp_path / "best.pt")
+    controller.reset(problem.start(torch.tensor(0)))
+    decision = controller.act()
+    assert len(decision.control) == len(decision.names) == 8
+    controller.update(decision.control, [None] * 8)
+    controller.update(controller.act().names, [None] * 8)
+    assert controller.steps == 2
+    with pytest.raises(ValueError, match="control must be legal for every robot"):
+        controller.update(["neighbour 3"] * 8, [None] * 8)
+    online = Controller.from_checkpoint(tmp_path / "best.pt", online=True)
+    assert isinstance(online.policy, MultiagentRollout)

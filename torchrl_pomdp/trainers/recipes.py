@@ -36,8 +36,8 @@ from torchrl_pomdp.trainers.policy_iteration import PolicyIteration
 __all__ = ["api", "multiagent_rollouts", "papi_nt", "papi_t", "r_nt", "r_t"]
 
 
-def r_nt(problem: Problem, base_policy: Policy, **options: Any) -> RolloutPolicy:
-    """Rollout without truncation: online, nothing is learnt.
+def r_nt(problem: Problem, base_policy: Policy, **options: Any) -> RolloutPolicy | MultiagentRollout:
+    """Rollout without truncation: online, nothing is learnt. One agent after the other where joint controls are too many.
 
     Args:
         problem: the problem.
@@ -52,7 +52,8 @@ def r_nt(problem: Problem, base_policy: Policy, **options: Any) -> RolloutPolicy
         >>> r_nt(problem, GreedyRepair(problem.model))(problem.start(torch.arange(2)))["action"].shape
         torch.Size([2])
     """
-    return RolloutPolicy(check_instance("problem", problem, Problem).model, base_policy, **options)
+    model = check_instance("problem", problem, Problem).model
+    return (RolloutPolicy if model.enumerable else MultiagentRollout)(model, base_policy, **options)
 
 
 def multiagent_rollouts(
