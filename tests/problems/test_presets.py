@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_pomdp.problems import PRESETS, make_problem
+from torchrl_pomdp.problems import PRESETS, make_problem, problem_from_spec
 
 # States, controls, observations and the model's own description of them.
 SIZES = {
@@ -55,3 +55,20 @@ def test_training_states_lie_in_their_parts_and_starts_are_startgame(name):
 def test_unknown_presets_are_refused():
     with pytest.raises(ValueError, match="unknown preset 'line4'; known presets: crying_baby, grid5x4"):
         make_problem("line4")
+
+
+def test_extensions_are_described_by_plain_json():
+    chains = [[[1.0, 0.0], [0.0, 1.0]], [[0.5, 0.5], [0.0, 1.0]], [[1.0, 0.0], [0.0, 1.0]]]
+    table = {
+        "graph": {"grid": [2, 2], "obstacles": [[1, 1]]},
+        "chain": chains,
+        "costs": [[0, 1], [0, 2], [0, 3]],
+        "discount": 0.9,
+        "repair_probability": 0.5,
+    }
+    model = problem_from_spec({"repair": table}).model
+    assert (model.num_locations, model.repair_probability) == (3, 0.5)
+    assert model.chain.tolist() == chains
+    assert model.costs.tolist() == table["costs"]
+    with pytest.raises(ValueError, match=r"repair\.repair_probability of spec: repair_probability must be in"):
+        problem_from_spec({"repair": {**table, "repair_probability": 0}})

@@ -24,7 +24,7 @@ __all__ = ["SpecError", "problem_from_spec"]
 
 # The kinds of problems; what else a description of any kind may have.
 _COMMON = ("name", "partitioned")
-_REPAIR = ("graph", "chain", "degradation", "costs", "discount", "robots", "start", "partition")
+_REPAIR = ("graph", "chain", "degradation", "costs", "discount", "robots", "repair_probability", "start", "partition")
 _TABULAR = ("discount", "transition", "observation", "cost", "start", "legal", "terminal", "controls", "observations", "states")
 # What the library's functions call what descriptions call otherwise.
 _RENAMED = {
@@ -168,6 +168,7 @@ def _repair(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
             _numbers("repair", table, "costs"),
             table["discount"],
             num_robots=table.get("robots", 1),
+            repair_probability=table.get("repair_probability", 1.0),
             start=lambda model: _checked(("repair", "start"), "", lambda: STARTS[started](model, starts[started], **more)),
             partition=SinglePart() if partition == "single" else None,
             device=device,
