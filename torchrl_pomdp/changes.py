@@ -12,11 +12,11 @@ from torchrl_pomdp.checks import check_callable, check_flag, check_integer
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES
 from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, damage_chain
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.modules import MultiagentRollout, RolloutPolicy
 from torchrl_pomdp.modules.repair import OldPolicy
 from torchrl_pomdp.problems import make_problem, repair_problem
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.problems.repair import DEGRADATION
+from torchrl_pomdp.trainers import r_nt
 
 __all__ = ["Change", "measure_changes", "model_changes"]
 
@@ -98,9 +98,8 @@ def measure_changes(
     for name, change in model_changes().items():
         problem, old = change.problem, change.policy
         # Many robots: simulations are cut, as their labels are.
-        many = not problem.model.enumerable
-        cut: dict[str, Any] = {"max_steps": 10, "terminal_cost": problem.pessimistic_cost} if many else {}
-        online = (MultiagentRollout if many else RolloutPolicy)(problem.model, old, trajectories=trajectories, **cut)
+        cut = {} if problem.model.enumerable else {"max_steps": 10, "terminal_cost": problem.pessimistic_cost}
+        online = r_nt(problem, old, trajectories=trajectories, **cut)
         policies = {"old policy": old, "rollout of it": online, "made anew": problem.base_policies["urgency"]}
         costs: dict[str, torch.Tensor] = {}
         found[name] = {}

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_mapping, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.modules.lookahead import RolloutPolicy
-from torchrl_pomdp.modules.multiagent import MultiagentRollout
 from torchrl_pomdp.modules.rollout import Policy, controls_of
 
 __all__ = ["Controller", "Decision"]
@@ -95,13 +93,13 @@ class Controller:
         """
         # Not at the top: whoever controls a robot by another policy needs no trainer.
         from torchrl_pomdp.trainers.checkpoint import load_checkpoint
+        from torchrl_pomdp.trainers.recipes import r_nt
 
         check_flag("online", online)
         checkpoint = load_checkpoint(path, problem=problem, device=device)
         model, policy = checkpoint.problem.model, checkpoint.policy
         if online:
-            rollout = RolloutPolicy if model.enumerable else MultiagentRollout
-            policy = rollout(model, policy, terminal_cost=checkpoint.problem.pessimistic_cost)
+            policy = r_nt(checkpoint.problem, policy, terminal_cost=checkpoint.problem.pessimistic_cost)
         return cls(model, policy)
 
     # ---- the loop ------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ iteration with application to autonomous sequential repair problems", Section II
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -18,9 +18,11 @@ from torchrl_pomdp.modules.qfactors import SimulatedQFactors, cheapest
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, controls_of
 from torchrl_pomdp.modules.truncation import Truncation
 
-__all__ = ["MultiagentRollout"]
+__all__ = ["SCHEMES", "MultiagentRollout"]
 
-_SCHEMES = ("one_at_a_time", "order_optimised", "autonomous")
+Scheme = Literal["one_at_a_time", "order_optimised", "autonomous"]
+SCHEMES: tuple[Scheme, ...] = get_args(Scheme)
+"""The schemes by name."""
 
 
 class MultiagentRollout(SimulatedQFactors):
@@ -84,7 +86,7 @@ class MultiagentRollout(SimulatedQFactors):
         model: BeliefModel,
         base_policy: Policy,
         *,
-        scheme: Literal["one_at_a_time", "order_optimised", "autonomous"] = "one_at_a_time",
+        scheme: Scheme = "one_at_a_time",
         signalling: Policy | None = None,
         trajectories: int = 10,
         leaves: Literal["control", "observation"] = "control",
@@ -111,12 +113,12 @@ class MultiagentRollout(SimulatedQFactors):
             chunk_rows=chunk_rows,
             compile=compile,
         )
-        self.scheme = check_choice("scheme", scheme, _SCHEMES)
+        self.scheme = check_choice("scheme", scheme, SCHEMES)
         if signalling is not None:
             check_callable("signalling", signalling)
             if scheme != "autonomous":
                 raise ValueError(f"signalling is for scheme='autonomous', got it for {scheme!r}")
-        self.base_policy, self.signalling = base_policy, signalling
+        self.signalling = signalling
         self.evaluated = 0
 
     @torch.no_grad()
@@ -128,7 +130,7 @@ class MultiagentRollout(SimulatedQFactors):
         self.model.check_state(check_instance("tensordict", tensordict, TensorDictBase))
         shape, model = tensordict.batch_size, self.model
         y = model.derive(tensordict.select(*model.state_keys).reshape(-1))
-        base = self._controls("base_policy", self.base_policy, y)
+        base = self._controls("base_policy", self.cost_to_go.base_policy, y)
         decide = {"one_at_a_time": self._in_turn, "order_optimised": self._best_first, "autonomous": self._at_once}
         controls, q = decide[self.scheme](y, base, model.agent_mask(y))
         action = model.join_controls(controls).reshape(*shape, *model.control_shape)

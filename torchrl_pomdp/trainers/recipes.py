@@ -29,6 +29,7 @@ from torchrl_pomdp.modules import (
     TerminalCost,
     Truncation,
 )
+from torchrl_pomdp.modules.multiagent import SCHEMES
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.trainers.plan import Evaluate, Improve
 from torchrl_pomdp.trainers.policy_iteration import PolicyIteration
@@ -80,14 +81,10 @@ def multiagent_rollouts(
     check_instance("problem", problem, Problem)
     steps = check_instance("config", config, PolicyIterationConfig).label_steps
     options: dict[str, Any] = {"trajectories": trajectories, "max_steps": steps, "terminal_cost": problem.pessimistic_cost}
-    schemes: dict[str, Any] = {
-        "one-at-a-time": "one_at_a_time",
-        "order-optimised": "order_optimised",
-        "autonomous": "autonomous",
+    schemes = SCHEMES if problem.model.enumerable else [scheme for scheme in SCHEMES if scheme != "order_optimised"]
+    return {
+        scheme.replace("_", "-"): MultiagentRollout(problem.model, base_policy, scheme=scheme, **options) for scheme in schemes
     }
-    if not problem.model.enumerable:
-        del schemes["order-optimised"]
-    return {name: MultiagentRollout(problem.model, base_policy, scheme=scheme, **options) for name, scheme in schemes.items()}
 
 
 def r_t(problem: Problem, base_policy: Policy, terminal_cost: TerminalCost, **options: Any) -> PartitionedPolicy:

@@ -346,7 +346,7 @@ class RepairModel(Robots):
         """For each robot the marginal ``[K, N]`` of its new location at the next stage, before it observes."""
         columns = []
         for robot, place in enumerate(location):
-            column = self._degrade(self._levels_at(planes, place).unsqueeze(0), place).squeeze(0)
+            column = self._degrade_planes(self._levels_at(planes, place).unsqueeze(0), place).squeeze(0)
             columns.append(torch.where(self._fixed(robot, location, repaired), self._repaired(column), column))
         return columns
 
@@ -390,11 +390,7 @@ class RepairModel(Robots):
             levels.append(level)
         return torch.stack(levels)
 
-    def _degrade_planes(self, planes: Tensor) -> Tensor:
-        """One step of the chain in every location."""
-        return self._degrade(planes)
-
-    def _degrade(self, planes: Tensor, place: Tensor | None = None) -> Tensor:
+    def _degrade_planes(self, planes: Tensor, place: Tensor | None = None) -> Tensor:
         """One step of the chains: a pass over the planes ``[L, K, N]`` for each nonzero diagonal.
 
         Args:
