@@ -35,7 +35,14 @@ from torchrl_pomdp.modules import (
     ZeroCost,
     rollout,
 )
-from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, SteadyStateCost, UrgencyRepair
+from torchrl_pomdp.modules.repair import (
+    GreedyRepair,
+    NeverRepairCost,
+    OldPolicy,
+    RelativeEncoder,
+    SteadyStateCost,
+    UrgencyRepair,
+)
 from torchrl_pomdp.modules.repair.scalar import expected_cost, repair_engine
 from torchrl_pomdp.modules.scalar import Allocation
 from torchrl_pomdp.noise import seed_keys
@@ -363,6 +370,32 @@ def test_networks_choose_as_in_batches(robots, mixed, kind):
     compiled = make()
     assert compiled.cost_to_go.scalar is not None
     assert_close(compiled.q_factors(y), without(make).q_factors(y))
+
+
+@pytest.mark.parametrize("kind", [UrgencyRepair, "networks"])
+def test_old_policies_in_a_changed_model(kind):
+    """Another chain, and two blocked edges, against which the old policies walk."""
+    graphs, costs = (grid(3, 3), grid(3, 3).without_edge(1, 4).without_edge(3, 4)), (0, 0.1, 1, 10)
+    old, new = (
+        RepairModel(graph, damage_chain(rates), costs, 0.95, num_robots=2).with_partition(RepairPartition(graph, costs))
+        for graph, rates in zip(graphs, [(0.0, 0.02, 0.03), (0.01, 0.1, 0.2)], strict=True)
+    )
+    policy = networks(old, {0: UrgencyRepair(old)}) if kind == "networks" else kind(old)
+    changed, y = OldPolicy(policy, old, new), some_states(new, 3, 200)
+    walls = old.split_controls(policy(old.derive(y))["action"]), new.agent_mask(y)
+    assert not walls[1].gather(-1, walls[0].unsqueeze(-1)).all()
+    means_the_same(new, changed, y, {"max_steps": 60, "terminal_cost": SteadyStateCost(new)}, 3)
+
+
+def test_old_policies_that_are_left_to_tensors(linear20):
+    old = linear20.model
+    dear, lost = (
+        RepairModel(old.graph, old.chain, 2 * old.costs, 0.95),
+        RepairModel(old.graph, old.chain, old.costs, 0.95, num_robots=2),
+    )
+    assert RolloutPolicy(dear, OldPolicy(UrgencyRepair(old), old, dear)).cost_to_go.scalar is None
+    assert RolloutPolicy(old, OldPolicy(UrgencyRepair(lost), lost, old, 1, 3)).cost_to_go.scalar is None
+    assert RolloutPolicy(old, OldPolicy(lambda y: y, old, old)).cost_to_go.scalar is None
 
 
 def test_networks_that_are_trained_further_are_read_again(linear20):

@@ -12,8 +12,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer
+from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.modules.rollout import Policy, controls_of
+from torchrl_pomdp.modules.scalar import Limited, ScalarEngine
 from torchrl_pomdp.tensor_checks import check_entries
 
 __all__ = ["OldPolicy"]
@@ -65,6 +67,13 @@ class OldPolicy(TensorDictModuleBase):
         for name, one, other in _shapes(old, new, 0 if lost is None else 1):
             if one != other:
                 raise ValueError(f"new must have as many {name} as old, got {other} for {one}")
+
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
+        """Compiled simulations, see :class:`~torchrl_pomdp.modules.scalar.ScalarEngine`; none where a robot is lost."""
+        from torchrl_pomdp.modules.repair.scalar.changed import changed_engine
+
+        fits = model is self.new and self.lost is None
+        return changed_engine(self.policy, self.old, self.new, limits) if fits else None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"`` for feature states of the changed model."""

@@ -121,7 +121,7 @@ class RepairEngine(ScalarEngine):
         numbers: int,
         refresh: Callable[[], None] | None,
     ) -> None:
-        self.policy, self.model, self.numbers, self._refresh = policy, model, numbers, refresh
+        self.policy, self.model, self.numbers, self.refresh = policy, model, numbers, refresh
         self._loops = Loops()
         self._spare: list[Work] = []
         # All joint controls, [U, R], once they have been asked for.
@@ -265,8 +265,8 @@ class RepairEngine(ScalarEngine):
     # ---- helpers -----------------------------------------------------------------------------------------------------
 
     def _bring_up_to_date(self) -> None:
-        if self._refresh is not None:
-            self._refresh()
+        if self.refresh is not None:
+            self.refresh()
 
     def _checked(self, y: TensorDictBase) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Beliefs ``[N, L, K]`` and locations ``[N, R]`` of states ``[*B]``; raises unless kind and shape are right."""

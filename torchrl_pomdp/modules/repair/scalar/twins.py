@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_pomdp.modules.repair.scalar.view import expected_cost, intact, jointly_legal, legal, part_of, probability, split
+from torchrl_pomdp.modules.repair.scalar.view import (
+    Tables,
+    View,
+    expected_cost,
+    intact,
+    jointly_legal,
+    legal,
+    part_of,
+    probability,
+    split,
+)
 from torchrl_pomdp.scalar.compiling import inner, products
 from torchrl_pomdp.scalar.noise import CONTROLS, fold, uniform
 from torchrl_pomdp.scalar.twins import choose, scalar_twin
 
-__all__ = ["greedy", "networks", "random", "urgency"]
+__all__ = ["elsewhere", "greedy", "networks", "random", "urgency"]
 
 
 @scalar_twin
@@ -167,3 +177,49 @@ def networks(data, view, controls):
         if layer < last:
             count = _positive(work, size, weights[layer].shape[2])
     _best_control(view, work, 2 * size, weights[last].shape[2], controls)
+
+
+@scalar_twin
+def elsewhere(data, view, controls):
+    """A policy that knows another graph; for a control that is illegal here, the first that is legal.
+
+    ``data`` holds what the old graph has: destinations, order, distances, first controls, first moves, whether intact
+    locations may be repaired; and the policy.
+    """
+    destinations, order, distances, first_controls, first_moves, unrestricted, policy = data
+    now = view.tables
+    old = Tables(
+        now.kind,
+        now.powers,
+        now.cumulative,
+        now.stage_costs,
+        now.interval_costs,
+        now.discounts,
+        destinations,
+        order,
+        distances,
+        first_controls,
+        first_moves,
+        unrestricted,
+        now.columns,
+        now.prices,
+        now.damage,
+        now.works,
+        now.absorbing,
+        now.steady,
+        now.free,
+        now.upward,
+        now.least_cost,
+        now.terminal_probability,
+        now.damage_threshold,
+        now.low,
+        now.high,
+    )
+    seen = View(view.stage, view.location, view.level, view.since, view.intact, view.start, old, view.work, view.key)
+    choose(policy, seen, controls)
+    for robot in range(len(controls)):
+        # What is no control at all stays one that is refused.
+        if controls[robot] >= 0 and not legal(view, robot, controls[robot]):
+            controls[robot] = 0
+            while not legal(view, robot, controls[robot]):
+                controls[robot] += 1
