@@ -84,6 +84,9 @@ _SAMPLES = {"linear20": 200_000, "line3": 200_000, "linear20_slow_repair": 200_0
 # repaired locations stay intact, as many as it takes to get to the damage.
 _MANY_ROBOTS = {"network32x4": 25, "network32x8": 5, "network32x10": 5}
 _MORE_SAMPLES = 500_000
+# Where a repair takes a random time, fewer trajectories of a label than these, or online than twice as many, make rollout worse
+# than its base policy.
+_SLOW_REPAIR = 20
 
 
 @dataclass(frozen=True)
@@ -168,7 +171,7 @@ def settings_config(settings: Literal["paper", "tuned"], problem: str, scale: fl
             validation_states=1000,
         )
     if settings == "tuned":
-        return common
+        return replace(common, trajectories=_SLOW_REPAIR) if problem == "linear20_slow_repair" else common
     return replace(
         common,
         iterations=common.iterations if problem in _MANY_ROBOTS else 2,
@@ -207,6 +210,9 @@ def plan(
         raise ValueError(f"problems must be among {experiment.problems} for {experiment.name}, got {unknown[0]!r}")
     runs = {}
     for problem in problems or experiment.problems:
+        online = 5 if settings == "tuned" else 10
+        if problem == "linear20_slow_repair":
+            online = 2 * _SLOW_REPAIR
         for algorithm in experiment.algorithms:
             config = settings_config(settings, problem, scale, seed)
             if algorithm == "API":
@@ -219,7 +225,7 @@ def plan(
                 config,
                 states=experiment.states,
                 online_states=experiment.states,
-                online_trajectories=5 if settings == "tuned" else 10,
+                online_trajectories=online,
             )
     return runs
 
