@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,9 +18,12 @@ from torchrl_pomdp.modules.scalar import Limited, SearchEngine, scalar_engine
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.tensor_checks import check_tensor
+from torchrl_pomdp.workers import LOCAL, Workers
 
 __all__ = ["Comparison", "Estimate", "compare", "discounted_costs", "estimate"]
 
+# Start states that other processes get at once; a single process gets them all.
+_BLOCK = 512
 # Half width of a 95 % interval in standard errors.
 _Z95 = 1.96
 
@@ -73,6 +77,7 @@ def discounted_costs(
     terminal_cost: TerminalCost | None = None,
     progress: bool = False,
     name: str = "evaluate",
+    workers: Workers = LOCAL,
 ) -> Tensor:
     """Discounted cost of one trajectory of ``policy`` from each of ``num_states`` start states.
 
@@ -91,6 +96,7 @@ def discounted_costs(
         terminal_cost: what a cut adds, see :class:`TruncatedRollout`.
         progress: whether to show a progress bar, which counts decisions.
         name: label of the progress bar.
+        workers: who computes; the bar counts start states where that is not this process.
 
     Returns:
         costs ``[num_states]``.
@@ -113,13 +119,40 @@ def discounted_costs(
     num_states = check_integer("num_states", num_states, 1, MAX_STATES)
     seed = check_integer("seed", seed)
     first = check_integer("first", first, 0, MAX_STATES)
-    keys = seed_keys(seed, torch.arange(first, first + num_states, device=model.device))
-    with progress_bar(None, "step", check_text("name", name), check_flag("progress", progress)) as bar:
-        cost = TruncatedRollout(model, _Watched(policy, bar), max_steps=max_steps, terminal_cost=terminal_cost)
-        costs = cost(model.drawn(start, fold(keys, 0), "start"), fold(keys, 1))
-        if cost.scalar is not None:
-            bar.update(cost.simulated_steps)
-        return costs
+    check_instance("workers", workers, Workers)
+    shared = model, policy, start, seed, max_steps, terminal_cost
+    name, progress = check_text("name", name), check_flag("progress", progress)
+    if workers is LOCAL:
+        with progress_bar(None, "step", name, progress) as bar:
+            return costs_of_states((*shared, bar), range(first, first + num_states))[0]
+    size = max(1, _BLOCK // workers.pieces)
+    blocks = [range(i, min(i + size, first + num_states)) for i in range(first, first + num_states, size)]
+    costs: list[Tensor] = []
+    with progress_bar(num_states, "state", name, progress) as bar:
+        tasks = workers.tasks(
+            costs_of_states, (*shared, None), blocks, lambda own: f"{name}, start states {own[0]} … {own[-1]}"
+        )
+        for handle, count in tasks:
+            costs.append(workers.fetch(handle))
+            bar.update(count)
+    return torch.cat(costs)
+
+
+def costs_of_states(shared: tuple[Any, ...], numbers: range) -> tuple[Tensor, int]:
+    """Costs of the trajectories from the start states with the given numbers, and how many they are.
+
+    Args:
+        shared: model, policy, start states, seed, number of stages, terminal cost, and a progress bar or None.
+        numbers: numbers of the start states.
+    """
+    model, policy, start, seed, max_steps, terminal_cost, bar = shared
+    keys = seed_keys(seed, torch.arange(numbers.start, numbers.stop, device=model.device))
+    watched = policy if bar is None else _Watched(policy, bar)
+    cost = TruncatedRollout(model, watched, max_steps=max_steps, terminal_cost=terminal_cost)
+    costs = cost(model.drawn(start, fold(keys, 0), "start"), fold(keys, 1))
+    if cost.scalar is not None and bar is not None:
+        bar.update(cost.simulated_steps)
+    return costs, len(numbers)
 
 
 class _Watched:

@@ -21,7 +21,7 @@ from torchrl_pomdp.trainers import (
     load_checkpoint,
     papi_nt,
     papi_t,
-    policy_iteration,
+    parts,
     r_t,
     save_checkpoint,
 )
@@ -127,7 +127,7 @@ def uninterrupted():
 
 @pytest.mark.parametrize("after", [0, 1, 4])
 def test_killed_and_resumed_equals_uninterrupted(uninterrupted, tmp_path, monkeypatch, after):
-    calls, train_part = [], policy_iteration.train_part
+    calls, train_part = [], parts.train_part
 
     def killed(*args, **options):
         if len(calls) == after:
@@ -135,7 +135,7 @@ def test_killed_and_resumed_equals_uninterrupted(uninterrupted, tmp_path, monkey
         calls.append(options["name"])
         return train_part(*args, **options)
 
-    monkeypatch.setattr(policy_iteration, "train_part", killed)
+    monkeypatch.setattr(parts, "train_part", killed)
     with pytest.raises(Killed):
         list(papi_t(own["problem"](), SMALL, own["threshold"], folder=tmp_path))
     monkeypatch.undo()

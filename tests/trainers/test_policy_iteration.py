@@ -9,7 +9,7 @@ import pytest
 import torch
 from torchrl.trainers import Trainer
 
-from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
+from torchrl_pomdp.collectors import PartSampler, RolloutImprovement, labels
 from torchrl_pomdp.envs import BeliefEnv, InPart
 from torchrl_pomdp.envs.repair import RandomState, RepairModel, RepairPartition, UniformStart, damage_chain, line
 from torchrl_pomdp.evaluation import compare, discounted_costs
@@ -34,11 +34,13 @@ from torchrl_pomdp.trainers import (
     make_networks,
     papi_nt,
     papi_t,
+    parts,
     r_nt,
     r_t,
     train_part,
 )
 from torchrl_pomdp.trainers import policy_iteration as module
+from torchrl_pomdp.trainers.parts import PartData
 
 TINY = PolicyIterationConfig(
     iterations=1,
@@ -193,7 +195,12 @@ def test_mirror_images_are_training_data_of_their_parts(line3):
         y = line3.model.with_features(line3.training[part](torch.arange(30)))
         y.set(("collector", "mask"), torch.ones(30, dtype=torch.bool))
         labelled[part] = RolloutPolicy(line3.model, GreedyRepair(line3.model), trajectories=1)(y)
-    images = algorithm._images(labelled)
+    images = {}
+    for part in labelled:
+        data = PartData(part, algorithm._images)
+        for source, block in labelled.items():
+            data.add(source, block)
+        images[part] = torch.cat(list(data))
     assert [len(images[part]) for part in (0, 1, 2)] == [60, 60, 60]
     left, right, repair = 1, 2, 0
     mirrored = images[0][30:]
@@ -288,7 +295,7 @@ class Killed(BaseException):
 def test_killed_and_resumed_equals_uninterrupted(line3, tmp_path, monkeypatch, where, recipe):
     config = replace(TINY, iterations=2)
     whole = run(line3, config, recipe, folder=tmp_path / "whole")
-    broken = {"label": (module.RolloutImprovement, "rollout"), "train": (module, "train_part"), "validate": (module, "compare")}
+    broken = {"label": (labels, "label_states"), "train": (parts, "train_part"), "validate": (module, "compare")}
     owner, name = broken[where]
     original, calls = getattr(owner, name), []
 

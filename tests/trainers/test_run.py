@@ -14,7 +14,7 @@ from torchrl_pomdp import kept as kept_results
 from torchrl_pomdp.files import load_tensors, save_tensors
 from torchrl_pomdp.modules.repair import UrgencyRepair
 from torchrl_pomdp.problems import make_problem
-from torchrl_pomdp.trainers import PolicyIterationConfig, load_checkpoint, parts, policy_iteration
+from torchrl_pomdp.trainers import PolicyIterationConfig, load_checkpoint, parts
 from torchrl_pomdp.trainers import run as module
 from torchrl_pomdp.trainers.checkpoint import open_run_folder
 from torchrl_pomdp.trainers.run import TrainingRun
@@ -56,7 +56,7 @@ def labelled(tmp_path_factory):
         raise Killed
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(policy_iteration, "train_part", killed)
+        patch.setattr(parts, "train_part", killed)
         with pytest.raises(Killed):
             RUN.carry_out(folder)
     assert list(folder.glob("**/*.labels/**/*.pt"))
@@ -70,7 +70,7 @@ def foreign(tmp_path_factory):
     done, killed = tmp_path_factory.mktemp("foreign") / "run", tmp_path_factory.mktemp("killed") / "run"
     run.carry_out(done)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(policy_iteration, "train_part", lambda *args, **options: (_ for _ in ()).throw(Killed()))
+        patch.setattr(parts, "train_part", lambda *args, **options: (_ for _ in ()).throw(Killed()))
         with pytest.raises(Killed):
             run.carry_out(killed)
     return done, killed

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.collectors import Collector
-from tqdm import tqdm
 
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_path, check_text
 from torchrl_pomdp.collectors.states import StateSampler
@@ -23,11 +23,26 @@ from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules.rollout import Policy, controls_of
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.progress import progress_bar
+from torchrl_pomdp.workers import LOCAL, Workers
 
 __all__ = ["LabelCollector", "OnLabels"]
 
+Summary = Callable[[TensorDictBase], Any]
 OnLabels = Callable[[int, bool], None]
 """Called with a number of labelled states, and whether an interrupted run had labelled them."""
+
+
+class Block(NamedTuple):
+    """Labelled states that some workers have.
+
+    Attributes:
+        handle: for the workers to find them by.
+        summary: what was to be told about them.
+    """
+
+    handle: Any
+    summary: Any
+
 
 # States that are drawn, labelled and kept at once on a CPU; the data do not depend on it. Many, because a rollout is slow at
 # its end, when few trajectories are left.
@@ -121,45 +136,68 @@ class LabelCollector(Collector):
         self.labeller = check_instance("label(model, policy)", label(self.env.model, self.policy), TensorDictModuleBase)
         self._batches, self.simulated_steps, self.seconds = 0, 0, 0.0
 
-    @torch.no_grad()
     def rollout(self) -> TensorDictBase:
         """The next batch of labelled states, ``[frames_per_batch]``."""
+        numbers = self._next_numbers()
+        batch: Any = torch.cat([block.handle for block in self._blocks(numbers, LOCAL, None)], 0)
+        batch.set(("collector", "traj_ids"), numbers)
+        return batch.set(("collector", "mask"), torch.ones_like(numbers, dtype=torch.bool))
+
+    def blocks(self, workers: Workers, summary: Summary) -> Iterator[Block]:
+        """The next batch block by block, labelled by ``workers``; nothing keeps all of it in memory.
+
+        Args:
+            workers: who labels.
+            summary: what to tell about the states of a block.
+        """
+        return self._blocks(self._next_numbers(), workers, summary)
+
+    def _next_numbers(self) -> Tensor:
+        """Numbers of the next batch's states."""
         size = self.requested_frames_per_batch
         # Batches are shared out in blocks, so that the workers' stacked batches are in order.
         first = (self._batches * self.num_workers + (self.worker_idx or 0)) * size
         self._batches += 1
-        index = torch.arange(first, first + size, device=self.env.device)
-        owner = "" if self.cache is None else digest([self.labeller, self.states])
-        with progress_bar(size, "state", self.name, self.progress) as bar:
-            blocks = [self._block(numbers, owner, bar) for numbers in index.split(rows_at_once(_BLOCK, index.device))]
-        batch: Any = torch.cat(blocks, 0)
-        batch.set(("collector", "traj_ids"), index)
-        return batch.set(("collector", "mask"), torch.ones_like(index, dtype=torch.bool))
+        return torch.arange(first, first + size, device=self.env.device)
 
-    def _block(self, numbers: Tensor, owner: str, bar: tqdm) -> TensorDictBase:
-        """Labelled states with the given numbers ``[N]``, from the cache where ``owner`` has made them."""
-        path = self.cache / f"{int(numbers[0]):012d}-{numbers.numel()}.pt" if self.cache is not None else None
-        owner = f"{owner} {path.name}" if path is not None else owner
-        content = kept(path, owner, self.env.device) if path is not None else None
-        cached = content is not None
-        if content is None:
-            content = self._label(numbers)
-            if path is not None:
-                keep(path, owner, content)
-        self.simulated_steps += content["simulated_steps"]
-        self.seconds += content["seconds"]
-        bar.update(numbers.numel())
-        if self.on_labels is not None:
-            self.on_labels(numbers.numel(), cached)
-        return TensorDict(content["states"], numbers.shape, device=self.env.device)
+    def _blocks(self, numbers: Tensor, workers: Workers, summary: Summary | None) -> Iterator[Block]:
+        """Blocks of labelled states with the given numbers, in order."""
+        pieces = numbers.split(max(1, rows_at_once(_BLOCK, numbers.device) // workers.pieces))
+        with progress_bar(len(numbers), "state", self.name, self.progress) as bar:
+            for own, (handle, report, cached) in zip(pieces, self._labelled(pieces, workers, summary), strict=True):
+                self.simulated_steps += report["simulated_steps"]
+                self.seconds += report["seconds"]
+                bar.update(len(own))
+                if self.on_labels is not None:
+                    self.on_labels(len(own), cached)
+                yield Block(handle, report["summary"])
 
-    def _label(self, numbers: Tensor) -> dict[str, Any]:
-        """Labelled states with the given numbers ``[N]``, and what they took."""
-        before, begin = self.labeller.simulated_steps, time.perf_counter()
-        model = self.env.model
-        block = self.labeller(model.derive(model.drawn(self.states, numbers, "states")))
-        steps, seconds = self.labeller.simulated_steps - before, time.perf_counter() - begin
-        return {"states": block.to_dict(), "simulated_steps": steps, "seconds": seconds}
+    def _labelled(
+        self, pieces: Sequence[Tensor], workers: Workers, summary: Summary | None
+    ) -> Iterator[tuple[Any, dict[str, Any], bool]]:
+        """Handle and report of each block, and whether it comes from the cache, where this labelling has made it."""
+        label = partial(workers.tasks, label_states, (self.env.model, self.labeller, self.states, summary), name=self._title)
+        if self.cache is None:
+            yield from ((handle, report, False) for handle, report in label(pieces))
+            return
+        owner, paths = digest([self.labeller, self.states]), [self.cache / f"{int(n[0]):012d}-{len(n)}.pt" for n in pieces]
+        there = [path.is_file() for path in paths]
+        made = label([own for own, found in zip(pieces, there, strict=True) if not found])
+        for own, path, found in zip(pieces, paths, there, strict=True):
+            content = kept(path, f"{owner} {path.name}", self.env.device) if found else None
+            if content is not None:
+                states = TensorDict(content.pop("states"), own.shape, device=self.env.device)
+                yield workers.put(states), {**content, "summary": summary and summary(states)}, True
+                continue
+            # A damaged block is made again by itself.
+            handle, report = next(label([own]) if found else made)
+            took = {key: report[key] for key in ("simulated_steps", "seconds")}
+            keep(path, f"{owner} {path.name}", {"states": workers.fetch(handle).to_dict(), **took})
+            yield handle, report, False
+
+    def _title(self, numbers: Tensor) -> str:
+        """What the labelling of a block is called."""
+        return f"{self.name}, states {int(numbers[0])} … {int(numbers[-1])}"
 
     def state_dict(self) -> dict[str, Any]:
         """State of the base policy and the number of batches made."""
@@ -170,6 +208,22 @@ class LabelCollector(Collector):
         state = dict(state_dict)
         self._batches = state.pop("batches")
         super().load_state_dict(state, **kwargs)
+
+
+def label_states(shared: tuple[Any, ...], numbers: Tensor) -> tuple[TensorDictBase, dict[str, Any]]:
+    """Labelled states with the given numbers ``[N]``; and what they took, and their summary if there is one.
+
+    Args:
+        shared: model, labelling module, numbered states, and what to tell about them.
+        numbers: numbers of the states, ``[N]``.
+    """
+    model, labeller, states, summary = shared
+    before, begin = labeller.simulated_steps, time.perf_counter()
+    with torch.no_grad():
+        block = labeller(model.derive(model.drawn(states, numbers, "states")))
+    seconds = time.perf_counter() - begin
+    report = {"simulated_steps": labeller.simulated_steps - before, "seconds": seconds, "summary": summary and summary(block)}
+    return block, report
 
 
 def _environment(create_env_fn: Any) -> BeliefEnv:

@@ -17,6 +17,7 @@ from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import check_keys
+from torchrl_pomdp.workers import LOCAL, Workers
 
 __all__ = ["StateMemory"]
 
@@ -73,9 +74,15 @@ class StateMemory:
         kept = self._states_of(part)
         return 0 if kept is None else kept[1].numel()
 
-    @torch.no_grad()
     def visit(
-        self, policy: Policy, start: StateGenerator, keys: Tensor, *, exploration: float = 0.0, max_steps: int | None = None
+        self,
+        policy: Policy,
+        start: StateGenerator,
+        keys: Tensor,
+        *,
+        exploration: float = 0.0,
+        max_steps: int | None = None,
+        workers: Workers = LOCAL,
     ) -> None:
         """Follow a policy from start states and remember what it visits.
 
@@ -87,6 +94,7 @@ class StateMemory:
         Keyword Args:
             exploration: probability of a random legal control at each step, in [0, 1].
             max_steps: length at which trajectories are cut; None: :attr:`BeliefModel.horizon`.
+            workers: who follows it.
 
         Raises:
             TypeError: if an argument is of the wrong kind.
@@ -96,13 +104,15 @@ class StateMemory:
         check_callable("policy", policy)
         check_callable("start", start)
         exploration = check_number("exploration", exploration, "[0, 1]")
+        check_instance("workers", workers, Workers)
         max_steps = check_integer("max_steps", self.model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
         if check_keys("keys", keys).ndim != 1:
             raise ValueError(f"keys must have shape [N], got {tuple(keys.shape)}")
-        for block in keys.split(rows_at_once(_BLOCK, keys.device)):
-            visited: list[Any] = list(self._walk(policy, start, block, exploration, max_steps))
-            if visited:
-                self._add(torch.cat(visited, 0))
+        shared = self.model, policy, start, exploration, max_steps, (self.retain, self.seed)
+        blocks = keys.split(max(1, rows_at_once(_BLOCK, keys.device) // workers.pieces))
+        for handle, found in workers.tasks(visits, shared, blocks, lambda own: f"visits of {len(own)} trajectories"):
+            if found:
+                self._add(workers.fetch(handle))
 
     def generator(self, part: int) -> StateGenerator:
         """Generator of the states of a part that are kept now, all equally likely.
@@ -126,42 +136,6 @@ class StateMemory:
     def _states_of(self, part: int) -> tuple[TensorDictBase, Tensor] | None:
         self._merge()
         return self._kept[check_integer("part", part, 0, len(self._kept) - 1)]
-
-    def _walk(
-        self, policy: Policy, start: StateGenerator, keys: Tensor, exploration: float, max_steps: int
-    ) -> Iterator[TensorDictBase]:
-        """The retained states of every step of the trajectories with the given keys."""
-        model = self.model
-        y = model.derive(model.drawn(start, fold(keys, _START), "start"))
-        scenarios = Scenarios.single(fold(keys, _STEPS))
-        for step in range(max_steps):
-            rest = (~model.is_terminal(y)).nonzero().squeeze(-1)
-            if rest.numel() < keys.numel():
-                y, keys, scenarios = take_rows(y, rest), keys[rest], scenarios.rows(rest)
-            if keys.numel() == 0:
-                return
-            yield self._retained(y)
-            u = controls_of("policy", policy, y.copy())
-            model.check_controls(y, u)
-            random = random_control(y.get("action_mask"), self._uniforms(keys, _CONTROL, step))
-            u = torch.where(self._uniforms(keys, _EXPLORE, step) < exploration, random, u)
-            noise, scenarios = scenarios.draw(torch.full_like(keys, step), model.observed(y, u), 1)
-            _, y = model.advance(y, u, noise)
-
-    def _uniforms(self, keys: Tensor, purpose: int, step: int) -> Tensor:
-        """A number for every control of a step, ``[N, *S]``: many agents explore each by itself."""
-        if self.model.enumerable:
-            return uniform(fold(keys, purpose), step)
-        agents = torch.arange(self.model.num_agents, device=keys.device)
-        return uniform(fold(fold(keys, purpose), step).unsqueeze(-1), agents)
-
-    def _retained(self, y: TensorDictBase) -> TensorDictBase:
-        """The rows of ``y`` that are retained, with their priority and part."""
-        entries = y.select(*self.model.state_keys)
-        priority = fold(self.model.fingerprint(entries), self.seed)
-        part = y.get("partition") if self.model.partition is not None else torch.zeros_like(priority)
-        rows = (uniform(priority, 0) < self.retain).nonzero().squeeze(-1)
-        return take_rows(entries, rows).update({"priority": priority[rows], "part": part[rows]})
 
     def _add(self, y: Any) -> None:
         """Remember ``y``; merge once more is pending than kept, so that what is kept is not copied at every call."""
@@ -189,3 +163,56 @@ class StateMemory:
             new[1:] = priority.diff() != 0
             chosen = new.nonzero().squeeze(-1)[: self.capacity]
             self._kept[part] = take_rows(states, order[chosen]), priority[chosen]
+
+
+def visits(shared: tuple[Any, ...], keys: Tensor) -> tuple[TensorDictBase | None, int]:
+    """The retained states of every step of the trajectories with the given keys, with their priority and part; and how many.
+
+    Args:
+        shared: model, policy, start states, exploration, number of steps, and how states are retained: probability and seed.
+        keys: keys of the trajectories, ``[N]``.
+    """
+    model, policy, start, exploration, max_steps, retention = shared
+    with torch.no_grad():
+        steps = _walk(model, policy, start, exploration, max_steps, keys)
+        found: list[Any] = [_retained(model, y, *retention) for y in steps]
+    states = torch.cat(found, 0) if found else None
+    return states, 0 if states is None else len(states)
+
+
+def _walk(
+    model: BeliefModel, policy: Policy, start: StateGenerator, exploration: float, max_steps: int, keys: Tensor
+) -> Iterator[TensorDictBase]:
+    """The states of every step of the trajectories with the given keys."""
+    y = model.derive(model.drawn(start, fold(keys, _START), "start"))
+    scenarios = Scenarios.single(fold(keys, _STEPS))
+    for step in range(max_steps):
+        rest = (~model.is_terminal(y)).nonzero().squeeze(-1)
+        if rest.numel() < keys.numel():
+            y, keys, scenarios = take_rows(y, rest), keys[rest], scenarios.rows(rest)
+        if keys.numel() == 0:
+            return
+        yield y
+        u = controls_of("policy", policy, y.copy())
+        model.check_controls(y, u)
+        random = random_control(y.get("action_mask"), _uniforms(model, keys, _CONTROL, step))
+        u = torch.where(_uniforms(model, keys, _EXPLORE, step) < exploration, random, u)
+        noise, scenarios = scenarios.draw(torch.full_like(keys, step), model.observed(y, u), 1)
+        _, y = model.advance(y, u, noise)
+
+
+def _uniforms(model: BeliefModel, keys: Tensor, purpose: int, step: int) -> Tensor:
+    """A number for every control of a step, ``[N, *S]``: many agents explore each by itself."""
+    if model.enumerable:
+        return uniform(fold(keys, purpose), step)
+    agents = torch.arange(model.num_agents, device=keys.device)
+    return uniform(fold(fold(keys, purpose), step).unsqueeze(-1), agents)
+
+
+def _retained(model: BeliefModel, y: TensorDictBase, retain: float, seed: int) -> TensorDictBase:
+    """The rows of ``y`` that are retained, with their priority and part."""
+    entries = y.select(*model.state_keys)
+    priority = fold(model.fingerprint(entries), seed)
+    part = y.get("partition") if model.partition is not None else torch.zeros_like(priority)
+    rows = (uniform(priority, 0) < retain).nonzero().squeeze(-1)
+    return take_rows(entries, rows).update({"priority": priority[rows], "part": part[rows]})

@@ -3,24 +3,31 @@ r"""Teaching the network of one part, under TorchRL's ``Trainer`` (paper, Sectio
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.objectives import LossModule
 from torchrl.record.loggers import Logger
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
 from torchrl_pomdp.checks import check_flag, check_instance, check_seed, check_text
 from torchrl_pomdp.config import PolicyIterationConfig
+from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.threads import kept_threads
+from torchrl_pomdp.problems.problem import Symmetry
 from torchrl_pomdp.progress import progress_bar
 
-__all__ = ["PartRecord", "train_part"]
+__all__ = ["MEMORY", "PartData", "PartImages", "PartJob", "PartRecord", "Trained", "train_part"]
+
+MEMORY = 2 << 30
+"""Bytes of a part's labelled states beyond which they are mapped to disk, in a temporary folder."""
 
 _LOG_INTERVAL = 50
 
@@ -48,8 +55,143 @@ class PartRecord:
         return asdict(self)
 
 
+@dataclass(frozen=True)
+class Trained:
+    """What the training of a part gives.
+
+    Attributes:
+        weights: state of the trained network.
+        seconds: time of optimisation.
+        losses: see :class:`PartRecord`.
+    """
+
+    weights: dict[str, Any]
+    seconds: float
+    losses: dict[str, float]
+
+
+class PartImages:
+    """Mirror images of labelled states, by the part in which they lie.
+
+    Args:
+        partition: the partition.
+        symmetries: the images, each a function of labelled states; the identity among them.
+
+    Examples:
+        >>> from torchrl_pomdp.problems import make_problem
+        >>> problem = make_problem("linear20")
+        >>> images = PartImages(problem.partition, problem.symmetries)
+        >>> y = problem.training[3](torch.arange(4)).set("action", torch.zeros(4, dtype=torch.int64))
+        >>> images.counts(y), [len(rows) for rows in images.of_part(5, y)]
+        ([0, 0, 0, 4, 0, 4], [0, 4])
+    """
+
+    def __init__(self, partition: Partition, symmetries: Sequence[Symmetry]) -> None:
+        self.partition, self.symmetries = partition, symmetries
+
+    def _images(self, block: TensorDictBase) -> Iterator[Any]:
+        for symmetry in self.symmetries:
+            image = symmetry(block)
+            # A symmetry need not know of parts.
+            yield image.set("partition", self.partition(image))
+
+    def counts(self, block: TensorDictBase) -> list[int]:
+        """How many images of labelled states ``[N]`` lie in each part."""
+        parts = torch.cat([image.get("partition") for image in self._images(block)])
+        return torch.bincount(parts, minlength=self.partition.num_parts).tolist()
+
+    def of_part(self, part: int, block: TensorDictBase) -> list[Any]:
+        """The images of labelled states ``[N]`` that lie in a part, for each symmetry."""
+        return [image[image.get("partition") == part] for image in self._images(block)]
+
+
+class PartData:
+    """Labelled states of a part that come block by block; past a stated size, :data:`MEMORY`, they are mapped to disk.
+
+    Args:
+        part: the part.
+        images: what becomes of the blocks.
+    """
+
+    def __init__(self, part: int, images: PartImages) -> None:
+        self.part, self.images = part, images
+        # By the part whose states were labelled and by symmetry, so that the order does not depend on the blocks.
+        self._rows: dict[tuple[int, int], list[Any]] = {}
+        self._bytes = 0
+        self._folder: TemporaryDirectory[str] | None = None
+
+    def add(self, source: int, block: TensorDictBase) -> None:
+        """Add the images of a block of labelled states of part ``source`` that lie in the part."""
+        for number, rows in enumerate(self.images.of_part(self.part, block)):
+            self._bytes += rows.bytes()
+            if self.large and len(rows):
+                rows = rows.memmap(self.folder / f"{source}-{number}-{len(self._rows.get((source, number), []))}")
+            self._rows.setdefault((source, number), []).append(rows)
+
+    def __iter__(self) -> Iterator[Any]:
+        """The blocks, in the order of the parts and symmetries."""
+        return (rows for key in sorted(self._rows) for rows in self._rows[key])
+
+    def __len__(self) -> int:
+        return sum(len(rows) for rows in self)
+
+    @property
+    def large(self) -> bool:
+        """Whether there is more than memory is for."""
+        return self._bytes > MEMORY
+
+    @property
+    def folder(self) -> Path:
+        """Temporary folder for what does not stay in memory."""
+        if self._folder is None:
+            self._folder = TemporaryDirectory(prefix="torchrl-pomdp-")
+        return Path(self._folder.name)
+
+    def close(self) -> None:
+        """Forget all."""
+        self._rows.clear()
+        if self._folder is not None:
+            self._folder.cleanup()
+
+
+@dataclass(frozen=True)
+class PartJob:
+    """The training of a part's network, all of it: it can be carried out anywhere.
+
+    Attributes:
+        part: the part.
+        name: what logs, errors and progress bars call it.
+        seed: seed of the batches.
+        network: the network before training.
+        loss: makes the loss module of a network.
+        images: see :class:`PartData`.
+        config: see :func:`train_part`.
+    """
+
+    part: int
+    name: str
+    seed: int
+    network: LocalNetwork
+    loss: Callable[[LocalNetwork], LossModule]
+    images: PartImages
+    config: PolicyIterationConfig
+
+    def open(self) -> PartData:
+        """Empty data."""
+        return PartData(self.part, self.images)
+
+    def train(self, data: PartData, logger: Logger | None, progress: bool) -> Trained:
+        """Train the network on the data, and close them."""
+        options: dict[str, Any] = {"seed": self.seed, "name": self.name, "logger": logger, "progress": progress}
+        try:
+            seconds, losses = train_part(data, self.loss(self.network), self.config, **options)
+        finally:
+            data.close()
+        return Trained(self.network.state_dict(), seconds, losses)
+
+
 def train_part(
-    batch: TensorDictBase,
+    batch: TensorDictBase | PartData,
     loss: LossModule,
     config: PolicyIterationConfig,
     *,
@@ -61,7 +203,7 @@ def train_part(
     """Train a loss module's network on labelled states, in place.
 
     Args:
-        batch: labelled states ``[N]``, from a :class:`~torchrl_pomdp.collectors.LabelCollector`.
+        batch: labelled states ``[N]``, from a :class:`~torchrl_pomdp.collectors.LabelCollector`; or data block by block.
         loss: loss module of the network that is trained.
         config: step size, batch size, epochs and least number of steps.
 
@@ -80,13 +222,14 @@ def train_part(
     """
     _check(batch, loss, config, logger)
     seed, name, progress = check_seed("seed", seed), check_text("name", name), check_flag("progress", progress)
-    size = batch.batch_size.numel()
+    size = len(batch)
     steps = max(config.least_steps, config.epochs * size // config.batch_size)
     optimizer = torch.optim.RMSprop(loss.parameters(), config.learning_rate)
     stepper = _Stepper(optimizer, steps, name, logger, progress)
+    buffer = _filled(batch, min(config.batch_size, size), seed)
     trainer = Trainer(
-        collector=_Labelled(batch),
-        total_frames=size,
+        collector=_Labelled(buffer[:1]),
+        total_frames=1,
         frame_skip=1,
         optim_steps_per_batch=steps,
         loss_module=loss,
@@ -94,14 +237,6 @@ def train_part(
         optimization_stepper=stepper,
         progress_bar=False,
     )
-    device = batch.device or torch.device("cpu")
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(size, device=device),
-        sampler=SamplerWithoutReplacement(),
-        batch_size=min(config.batch_size, size),
-        generator=torch.Generator(device).manual_seed(seed),
-    )
-    trainer.register_op("batch_process", partial(_store, buffer))
     trainer.register_op("process_optim_batch", lambda batch: buffer.sample())
     begin = time.perf_counter()
     # Products of a few rows are slower with several threads than with one, and sums of gradients would depend on their number.
@@ -110,18 +245,41 @@ def train_part(
     return time.perf_counter() - begin, stepper.final()
 
 
-def _check(batch: TensorDictBase, loss: LossModule, config: PolicyIterationConfig, logger: Logger | None) -> None:
-    check_instance("batch", batch, TensorDictBase)
+def _filled(batch: TensorDictBase | PartData, size: int, seed: int) -> TensorDictReplayBuffer:
+    """A replay buffer of the states that gives batches of a size; on disk where the states are."""
+    blocks: list[Any] = [batch] if isinstance(batch, TensorDictBase) else list(batch)
+    device = blocks[0].device or torch.device("cpu")
+    if isinstance(batch, PartData) and batch.large:
+        storage = LazyMemmapStorage(len(batch), scratch_dir=str(batch.folder / "buffer"), device=device)
+    else:
+        storage = LazyTensorStorage(len(batch), device=device)
+    buffer = TensorDictReplayBuffer(
+        storage=storage,
+        sampler=SamplerWithoutReplacement(),
+        batch_size=size,
+        generator=torch.Generator(device).manual_seed(seed),
+    )
+    for block in blocks:
+        if len(block):
+            buffer.extend(block.exclude("collector"))
+    return buffer
+
+
+def _check(batch: Any, loss: LossModule, config: PolicyIterationConfig, logger: Logger | None) -> None:
+    if not isinstance(batch, PartData):
+        check_instance("batch", batch, TensorDictBase)
     check_instance("loss", loss, LossModule)
     check_instance("config", config, PolicyIterationConfig)
     if logger is not None:
         check_instance("logger", logger, Logger)
-    if batch.ndim != 1 or batch.batch_size[0] == 0:
+    if isinstance(batch, TensorDictBase) and batch.ndim != 1:
         raise ValueError(f"batch must hold labelled states [N], at least one, got batch {tuple(batch.batch_size)}")
+    if len(batch) == 0:
+        raise ValueError("batch must hold labelled states [N], at least one, got none")
 
 
 class _Labelled:
-    """Labelled states as a ``Trainer`` takes them: a collector of a single batch."""
+    """What a ``Trainer`` takes as a collector: a single batch, as the states are in the buffer already."""
 
     init_random_frames = 0
 
@@ -173,8 +331,3 @@ class _Stepper(DefaultOptimizationStepper):
     def final(self) -> dict[str, float]:
         """Mean losses of the last tenth of the steps."""
         return {key: total / self._tail for key, total in self._sums.items()}
-
-
-def _store(buffer: TensorDictReplayBuffer, batch: TensorDictBase) -> TensorDictBase:
-    buffer.extend(batch.exclude("collector"))
-    return batch

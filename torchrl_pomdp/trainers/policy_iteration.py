@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.record.loggers import Logger
 
@@ -57,8 +56,9 @@ from torchrl_pomdp.trainers.architecture import (
     make_values,
 )
 from torchrl_pomdp.trainers.logs import clear_log
-from torchrl_pomdp.trainers.parts import PartRecord, train_part
+from torchrl_pomdp.trainers.parts import PartImages, PartJob, PartRecord
 from torchrl_pomdp.trainers.plan import Evaluate, Improve, Step, checked_plan
+from torchrl_pomdp.workers import LOCAL, Training, Workers
 
 __all__ = ["Iteration", "PolicyIteration"]
 
@@ -113,6 +113,7 @@ class PolicyIteration:
         logger: TorchRL logger of losses; None logs nothing.
         progress: whether to show progress bars with rates.
         on_labels: called as states are labelled, with their number and whether an interrupted run had labelled them.
+        workers: who labels, evaluates and trains; by default this process.
 
     Raises:
         TypeError: if an argument is of the wrong kind.
@@ -143,6 +144,7 @@ class PolicyIteration:
         logger: Logger | None = None,
         progress: bool = False,
         on_labels: OnLabels | None = None,
+        workers: Workers = LOCAL,
     ) -> None:
         self.partition = check_instance("problem", problem, Problem).partition
         self.problem, self.config = problem, check_instance("config", config, PolicyIterationConfig)
@@ -152,10 +154,12 @@ class PolicyIteration:
         self.logger = None if logger is None else check_instance("logger", logger, Logger)
         self.progress = check_flag("progress", progress)
         self.on_labels = None if on_labels is None else check_callable("on_labels", on_labels)
+        self.workers = check_instance("workers", workers, Workers)
         self._scale = problem.pessimistic_cost
         # Agents that decide in turn cannot change places.
         keep_order = config.multiagent and problem.model.num_agents > 1
-        self._symmetries = problem.symmetries[: None if config.symmetries and not keep_order else 1]
+        symmetries = problem.symmetries[: None if config.symmetries and not keep_order else 1]
+        self._images = PartImages(self.partition, symmetries)
         self._multiagent = is_multiagent(problem, config)
         self._start()
 
@@ -258,31 +262,29 @@ class PolicyIteration:
     def _train_step(
         self, index: int, networks: dict[int, LocalNetwork], local: list[Any], values: list[Any], number: int
     ) -> dict[str, PartRecord]:
-        """Label states of the step's parts, train their networks in place, and keep them."""
+        """Label states of the step's parts, train their networks, and keep them."""
         step, name = self.plan[index], self._name(number, index)
         while self._unvisited:
             self._visit(*self._unvisited.pop(0))
         path = self._path(name)
         cache = path.with_suffix(".labels") if path is not None else None
         make = partial(self._collector, index, PartitionedPolicy(local), PartitionedValue(values), number, cache)
+        trainings = {part: self._training(index, part, network, number) for part, network in networks.items()}
         collectors = {part: make(part) for part in step.parts}
-        labelled: dict[int, Any] = {part: next(iter(collector)) for part, collector in collectors.items()}
-        images = self._images(labelled)
+        for part, collector in collectors.items():
+            for block in collector.blocks(self.workers, self._images.counts):
+                for other, training in trainings.items():
+                    if block.summary[other]:
+                        training.add(part, block.handle)
         records = {}
-        for part, network in networks.items():
-            clear_log(self.logger, f"{name}-part-{part}")
-            seconds, losses = train_part(
-                images[part],
-                ClassificationLoss(network, self.config.loss) if isinstance(step, Improve) else ValueLoss(network, self._scale),
-                self.config,
-                seed=self._seed(number, "batches", part, index),
-                name=f"{name}-part-{part}",
-                logger=self.logger,
-                progress=self.progress,
-            )
-            collector = collectors[part]
+        for part, trained in self.workers.trained(trainings).items():
+            networks[part].load_state_dict(trained.weights)
             records[f"{name}-part-{part}"] = PartRecord(
-                labelled[part].shape[0], collector.simulated_steps, collector.seconds, seconds, losses
+                collectors[part].requested_frames_per_batch,
+                collectors[part].simulated_steps,
+                collectors[part].seconds,
+                trained.seconds,
+                trained.losses,
             )
         if path is not None and cache is not None:
             states = {str(part): network.state_dict() for part, network in networks.items()}
@@ -292,21 +294,19 @@ class PolicyIteration:
             shutil.rmtree(cache, ignore_errors=True)
         return records
 
+    def _training(self, index: int, part: int, network: LocalNetwork, number: int) -> Training:
+        """The training of a part's network in a step."""
+        name = f"{self._name(number, index)}-part-{part}"
+        clear_log(self.logger, name)
+        improves = isinstance(self.plan[index], Improve)
+        loss = partial(ClassificationLoss, loss=self.config.loss) if improves else partial(ValueLoss, scale=self._scale)
+        seed = self._seed(number, "batches", part, index)
+        job = PartJob(part, name, seed, network, loss, self._images, self.config)
+        return self.workers.training(job, self.logger, self.progress)
+
     def _path(self, name: str) -> Path | None:
         """File of a step's networks; None where nothing is kept."""
         return None if self.folder is None else self.folder / f"{name}.pt"
-
-    def _images(self, labelled: dict[int, Any]) -> dict[int, TensorDictBase]:
-        """For every part, the labelled states and mirror images of labelled states that lie in it."""
-        images: dict[int, list[Any]] = {part: [] for part in labelled}
-        for batch in labelled.values():
-            for symmetry in self._symmetries:
-                image = symmetry(batch.exclude("collector"))
-                # A symmetry need not know of parts.
-                image.set("partition", self.partition(image))
-                for part, found in images.items():
-                    found.append(image[image.get("partition") == part])
-        return {part: cast(TensorDictBase, torch.cat(found)) for part, found in images.items()}
 
     def _collector(
         self,
@@ -333,7 +333,7 @@ class PolicyIteration:
             "total_frames": samples,
             "cache": cache / str(part) if cache is not None else None,
             "progress": self.progress,
-            "name": f"label {type(step).__name__.lower()} part {part}",
+            "name": f"label {self._name(number, index)}, part {part}",
             "on_labels": self.on_labels,
         }
         env = BeliefEnv(problem.model, problem.start)
@@ -348,7 +348,8 @@ class PolicyIteration:
         config = self.config
         count = math.ceil(config.visits_per_label * config.samples_per_part * self.partition.num_parts)
         keys = seed_keys(self._seed(number, "visits"), torch.arange(count, device=self.problem.model.device))
-        self.memory.visit(policy, self.problem.start, keys, exploration=config.exploration, max_steps=config.max_steps)
+        options: dict[str, Any] = {"exploration": config.exploration, "max_steps": config.max_steps, "workers": self.workers}
+        self.memory.visit(policy, self.problem.start, keys, **options)
 
     def _validate(self, policy: TensorDictModuleBase, name: str) -> torch.Tensor:
         problem, config = self.problem, self.config
@@ -362,6 +363,7 @@ class PolicyIteration:
             terminal_cost=self._scale,
             progress=self.progress,
             name=f"validate {name}",
+            workers=self.workers,
         )
 
     def _seed(self, iteration: int, purpose: str, part: int = 0, index: int = 0) -> int:

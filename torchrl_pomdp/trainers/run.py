@@ -27,6 +27,7 @@ from torchrl_pomdp.trainers.architecture import is_multiagent
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
 from torchrl_pomdp.trainers.recipes import api, multiagent_rollouts, papi_nt, papi_t, r_nt, r_t
+from torchrl_pomdp.workers import LOCAL, Workers
 
 __all__ = ["ALGORITHMS", "TrainingRun"]
 
@@ -116,6 +117,7 @@ class TrainingRun:
         progress: bool = False,
         report: Report = lambda name, comparison: None,
         on_labels: OnLabels | None = None,
+        workers: Workers = LOCAL,
     ) -> dict[str, Comparison]:
         """Train and evaluate, or go on where an interrupted run with the same numbers stopped.
 
@@ -128,6 +130,7 @@ class TrainingRun:
             progress: whether to show progress bars.
             report: called with the name of a policy and its comparison with the baseline as soon as it is known.
             on_labels: see :class:`PolicyIteration`.
+            workers: who does the work; they change no result.
 
         Returns:
             comparisons with the baseline, the problem's first base policy, by policy, in the order of the evaluations; online
@@ -143,9 +146,10 @@ class TrainingRun:
         check_callable("report", report)
         if on_labels is not None:
             check_callable("on_labels", on_labels)
+        check_instance("workers", workers, Workers)
         identity = _identity(self)
         path = open_run_folder(folder, identity)
-        execution = _Execution(self, self.problem, path, identity, progress, report, on_labels)
+        execution = _Execution(self, self.problem, path, identity, progress, report, on_labels, workers)
         try:
             return execution.carry_out()
         except OSError as error:
@@ -162,6 +166,7 @@ class _Execution:
     progress: bool
     report: Report
     on_labels: OnLabels | None
+    workers: Workers
     results: dict[str, Comparison] = field(default_factory=dict)
 
     def carry_out(self) -> dict[str, Comparison]:
@@ -203,6 +208,7 @@ class _Execution:
             logger=CSVLogger("log", log_dir=str(self.folder)),
             progress=self.progress,
             on_labels=self.on_labels,
+            workers=self.workers,
         )
         untrained_value = PartitionedValue([self.problem.pessimistic_cost] * self.problem.partition.num_parts)
         untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, base, untrained_value)
@@ -269,6 +275,7 @@ class _Execution:
             terminal_cost=self.problem.pessimistic_cost,
             progress=self.progress,
             name=f"evaluate {name}",
+            workers=self.workers,
         ).cpu()
         self.check_folder()
         keep(path, owner, {"costs": costs})

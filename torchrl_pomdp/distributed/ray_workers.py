@@ -1,0 +1,185 @@
+"""Tasks and trainings on a Ray cluster: the same plans, and the same results, as in one process."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import ray
+import torch
+from ray.exceptions import RayError, RayTaskError
+from torchrl.record.loggers import Logger
+
+from torchrl_pomdp.checks import check_integer, check_text
+from torchrl_pomdp.distributed.part_actor import PartActor
+from torchrl_pomdp.workers import PartTraining, Task, Training, Workers
+
+__all__ = ["RayWorkers", "WorkerError"]
+
+# Tasks that are given out for each worker: one that it does, and one that waits, so that no worker does.
+_AHEAD = 2
+# How often a task of a worker that dies is done again: with the same seeds, so that nothing changes.
+_RETRIES = 5
+_LOOPBACK = "127.0.0.1"
+
+
+class WorkerError(RuntimeError):
+    """Work has failed elsewhere; the message says which, and why."""
+
+
+class RayWorkers(Workers):
+    """Workers of a Ray cluster: stateless tasks, and an actor for each part that trains its network.
+
+    Results are those of one process, to the last bit, whatever the number of workers, if all machines are alike. A task or
+    training whose process dies is done again with the same seeds. Use it as a context, which releases Ray at its end.
+
+    Args:
+        address: a running cluster, as ``ray.init`` takes it; None starts one on this machine, reachable from it alone and
+            without a dashboard, which is stopped in the end. Where Ray runs in this process already, it is used.
+        num_workers: how many tasks are done at once; None: as many as the cluster has CPUs.
+
+    Raises:
+        TypeError: if an argument is of the wrong kind.
+        ValueError: if ``num_workers`` is not positive.
+        ConnectionError: if there is no cluster at the address.
+
+    Examples:
+        Ray takes some seconds to start::
+
+            with RayWorkers(num_workers=2) as workers:
+                for iteration in papi_nt(problem, config, base_policy, workers=workers):
+                    print(iteration.reason)
+    """
+
+    pieces = 8
+
+    def __init__(self, address: str | None = None, num_workers: int | None = None) -> None:
+        if address is not None:
+            check_text("address", address)
+        wanted = None if num_workers is None else check_integer("num_workers", num_workers, 1, 10**5)
+        self._own = not ray.is_initialized()
+        if self._own and address is None:
+            ray.init("local", num_cpus=wanted, include_dashboard=False, log_to_driver=False, _node_ip_address=_LOOPBACK)
+        elif self._own:
+            ray.init(address, log_to_driver=False)
+        self.num_workers = wanted or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        self._actors: dict[int, Any] = {}
+        self._do: Any = ray.remote(num_returns=2, num_cpus=1, max_retries=_RETRIES)(_do)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the actors, and the cluster if it was started here."""
+        for actor in self._actors.values():
+            ray.kill(actor)
+        self._actors.clear()
+        if self._own:
+            ray.shutdown()
+            self._own = False
+
+    def tasks(self, function: Task, shared: Any, items: Sequence[Any], name: Callable[[Any], str]) -> Iterator[tuple[Any, Any]]:
+        """See :meth:`Workers.tasks`."""
+        waiting: deque[tuple[Any, Any, Any]] = deque()
+        left, everyone = deque(items), [ray.put(shared)] if items else []
+        try:
+            while left or waiting:
+                while left and len(waiting) < _AHEAD * self.num_workers:
+                    item = left.popleft()
+                    waiting.append((*self._do.remote(function, everyone, item), item))
+                handle, report, item = waiting.popleft()
+                yield handle, self._get(report, name(item))
+        finally:
+            for _, report, _ in waiting:
+                ray.cancel(report)
+
+    def fetch(self, handle: Any) -> Any:
+        """See :meth:`Workers.fetch`."""
+        return self._get(handle, "a result")
+
+    def put(self, value: Any) -> Any:
+        """See :meth:`Workers.put`."""
+        return ray.put(value)
+
+    def training(self, job: PartTraining, logger: Logger | None, progress: bool) -> Training:
+        """See :meth:`Workers.training`; progress is shown by the number of trained parts."""
+        if job.part not in self._actors:
+            # They take a CPU only while they train, when nothing is labelled.
+            options: dict[str, Any] = {"num_cpus": 0, "scheduling_strategy": "SPREAD"}
+            made: Any = ray.remote(max_restarts=-1, max_task_retries=-1, **options)(PartActor)
+            self._actors[job.part] = made.remote()
+        return RayTraining(self._actors[job.part], job, logger, self._get)
+
+    def trained(self, trainings: Mapping[int, Training]) -> dict[int, Any]:
+        """See :meth:`Workers.trained`; as many at once as there are workers."""
+        waiting, found = list(trainings), {}
+        for key in waiting[: self.num_workers]:
+            trainings[key].start()
+        for number, key in enumerate(waiting):
+            found[key] = trainings[key].result()
+            for following in waiting[number + self.num_workers : number + self.num_workers + 1]:
+                trainings[following].start()
+        return found
+
+    def _get(self, reference: Any, name: str) -> Any:
+        """What a reference gives; says what has failed."""
+        try:
+            return ray.get(reference)
+        except RayTaskError as error:
+            cause = error.cause
+            raise WorkerError(f"{name}: {type(cause).__name__}: {cause}") from error
+        except RayError as error:
+            raise WorkerError(f"{name}: {type(error).__name__}: {error}") from error
+
+
+class RayTraining(Training):
+    """The training of a part by its actor, which fetches the blocks itself.
+
+    Args:
+        actor: the part's actor.
+        job: see :class:`PartTraining`.
+        logger: logger of the losses, which are written once it has trained.
+        get: what a reference gives; by reference and name.
+    """
+
+    def __init__(self, actor: Any, job: PartTraining, logger: Logger | None, get: Callable[[Any, str], Any]) -> None:
+        self.actor, self.job, self.logger, self._get = actor, job, logger, get
+        self._blocks: list[tuple[int, Any]] = []
+        self.reference: Any = None
+
+    def add(self, source: int, handle: Any) -> None:
+        """See :meth:`Training.add`."""
+        self._blocks.append((source, handle))
+
+    def start(self) -> None:
+        """See :meth:`Training.start`."""
+        self.reference = self.actor.train.remote(self.job, self._blocks)
+
+    def result(self) -> Any:
+        """See :meth:`Training.result`."""
+        trained, rows = self._get(self.reference, f"train {self.job.name}")
+        if self.logger is not None:
+            for name, value, step in rows:
+                self.logger.log_scalar(name, value, step=step)
+        return trained
+
+
+# What this worker process has read of the shared values, the latest alone: tables and compiled loops are made once.
+_shared: dict[str, Any] = {}
+
+
+def _do(function: Task, everyone: list[Any], item: Any) -> tuple[Any, Any]:
+    """A task in a worker process."""
+    torch.set_num_threads(1)
+    (reference,) = everyone
+    key = reference.hex()
+    if key not in _shared:
+        value = ray.get(reference)
+        _shared.clear()
+        _shared[key] = value
+    return function(_shared[key], item)
