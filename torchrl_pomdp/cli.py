@@ -52,6 +52,19 @@ class Train:
     device: str = "cpu"
     """Device to compute on, such as cpu or cuda:0."""
 
+    backend: Literal["local", "ray"] = "local"
+    """Who does the work: this process; or the workers of a Ray cluster, with the same results. Needs the extra ray."""
+
+    address: str | None = None
+    """Address of a running Ray cluster, such as 10.0.0.1:6379; by default one is started on this machine."""
+
+    workers: int | None = None
+    """Ray workers that label and evaluate at the same time; by default as many as the cluster has CPUs."""
+
+    staleness: int | None = None
+    """Asynchronous policy iteration: every part trains at its own pace, at most so many versions ahead of the last one. A seed
+    does not give the same result again."""
+
 
 @dataclass(frozen=True)
 class Evaluate:
@@ -165,7 +178,9 @@ class Problems:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the command with ``args`` (default: the process's); returns the exit status, 2 for input that was refused."""
+    """Run the command with ``args`` (default: the process's); returns the exit status: 2 for input that was refused, 1 for
+    work that has failed elsewhere.
+    """
     if isinstance(sys.stdout, io.TextIOWrapper):
         # What a terminal cannot show is no reason to lose a table.
         sys.stdout.reconfigure(errors="replace")
@@ -181,6 +196,7 @@ def main(args: list[str] | None = None) -> int:
     from torchrl import logger
 
     from torchrl_pomdp import commands
+    from torchrl_pomdp.workers import WorkerError
 
     logger.setLevel("WARNING")
     try:
@@ -199,6 +215,9 @@ def main(args: list[str] | None = None) -> int:
     except (ValueError, TypeError, OSError, ImportError) as error:
         print(f"torchrl-pomdp: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except WorkerError as error:
+        print(f"torchrl-pomdp: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
     return 0
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -29,6 +31,7 @@ from torchrl_pomdp.reproduce import reproduce as reproduce_experiment
 from torchrl_pomdp.tensor_checks import check_device
 from torchrl_pomdp.trainers import compare_peers, load_checkpoint, r_nt
 from torchrl_pomdp.trainers.run import TrainingRun
+from torchrl_pomdp.workers import LOCAL, Workers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,12 +45,14 @@ def train(command: Train) -> None:
     """Carry out a training run; print its table, then draw its pictures."""
     config = PolicyIterationConfig(**asdict(command.config))
     given = find_problem(command.problem, check_device("device", command.device))
-    run = TrainingRun(given, command.algorithm, command.base or given.baseline, config, command.states, command.online_states)
+    numbers: dict[str, Any] = {"states": command.states, "online_states": command.online_states, "staleness": command.staleness}
+    run = TrainingRun(given, command.algorithm, command.base or given.baseline, config, **numbers)
     problem = run.problem
     default = Path("runs") / f"{problem.name}-{command.algorithm}-{run.base}-seed{config.seed}"
     out = check_folder("out", command.out or default)
     print(f"{problem.name}: {problem.model.describe()}\nrun folder: {out}", flush=True)
-    comparisons = run.carry_out(out, progress=True, report=partial(_tell, problem.baseline))
+    with _workers(command) as workers:
+        comparisons = run.carry_out(out, progress=True, report=partial(_tell, problem.baseline), workers=workers)
     results = [Result(name, comparison) for name, comparison in comparisons.items()]
     print(f"\n{table(results)}\n", flush=True)
     write_json(out / "provenance.json", provenance())
@@ -64,6 +69,20 @@ def train(command: Train) -> None:
             f"no iteration was accepted: best.pt is the base policy, {best.name}. What usually helps: more --samples-per-part, "
             "more --validation-states, more --trajectories"
         )
+
+
+def _workers(command: Train) -> AbstractContextManager[Workers]:
+    """Who does the work of a training."""
+    if command.backend == "local":
+        for name in ("address", "workers"):
+            if getattr(command, name) is not None:
+                raise ValueError(f"{name} is for --backend ray, got {getattr(command, name)} for the backend local")
+        return nullcontext(LOCAL)
+    if find_spec("ray") is None:
+        raise ValueError("backend ray needs Ray: pip install 'torchrl-pomdp[ray]'")
+    from torchrl_pomdp.distributed import RayWorkers
+
+    return RayWorkers(command.address, command.workers)
 
 
 def _tell(baseline: str, name: str, comparison: Comparison) -> None:

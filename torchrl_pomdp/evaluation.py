@@ -119,7 +119,7 @@ def discounted_costs(
     num_states = check_integer("num_states", num_states, 1, MAX_STATES)
     seed = check_integer("seed", seed)
     first = check_integer("first", first, 0, MAX_STATES)
-    check_instance("workers", workers, Workers)
+    check_instance("workers", workers, Workers).check_device(model.device)
     shared = model, policy, start, seed, max_steps, terminal_cost
     name, progress = check_text("name", name), check_flag("progress", progress)
     if workers is LOCAL:

@@ -10,12 +10,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
+import torch
 from torchrl.record.loggers import Logger
 
-__all__ = ["LOCAL", "LocalWorkers", "PartTraining", "Task", "Training", "Workers"]
+__all__ = ["LOCAL", "LocalWorkers", "PartTraining", "Task", "Training", "WorkerError", "Workers"]
 
 Task = Callable[[Any, Any], tuple[Any, Any]]
 """A stateless task: from what all of its kind share, and from what is its own, a result and a small report of it."""
+
+
+class WorkerError(RuntimeError):
+    """Work has failed elsewhere; the message says which, and why."""
 
 
 class PartTraining(Protocol):
@@ -60,6 +65,10 @@ class Workers(ABC):
     """
 
     pieces: int
+
+    @abstractmethod
+    def check_device(self, device: torch.device) -> None:
+        """Raise ``ValueError`` unless the workers can compute with models on a device."""
 
     @abstractmethod
     def tasks(self, function: Task, shared: Any, items: Sequence[Any], name: Callable[[Any], str]) -> Iterator[tuple[Any, Any]]:
@@ -110,6 +119,9 @@ class LocalWorkers(Workers):
     """
 
     pieces = 1
+
+    def check_device(self, device: torch.device) -> None:
+        """See :meth:`Workers.check_device`: any."""
 
     def tasks(self, function: Task, shared: Any, items: Sequence[Any], name: Callable[[Any], str]) -> Iterator[tuple[Any, Any]]:
         """See :meth:`Workers.tasks`."""

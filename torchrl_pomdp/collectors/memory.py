@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -63,6 +64,8 @@ class StateMemory:
         self._kept: list[tuple[TensorDictBase, Tensor] | None] = [None] * parts
         # Retained states that are not merged with those yet.
         self._pending: list[TensorDictBase] = []
+        # Parts that improve at their own pace read while others write.
+        self._lock = threading.RLock()
 
     def count(self, part: int) -> int:
         """Number of states of a part.
@@ -104,7 +107,7 @@ class StateMemory:
         check_callable("policy", policy)
         check_callable("start", start)
         exploration = check_number("exploration", exploration, "[0, 1]")
-        check_instance("workers", workers, Workers)
+        check_instance("workers", workers, Workers).check_device(self.model.device)
         max_steps = check_integer("max_steps", self.model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
         if check_keys("keys", keys).ndim != 1:
             raise ValueError(f"keys must have shape [N], got {tuple(keys.shape)}")
@@ -134,15 +137,17 @@ class StateMemory:
         return draw
 
     def _states_of(self, part: int) -> tuple[TensorDictBase, Tensor] | None:
-        self._merge()
+        with self._lock:
+            self._merge()
         return self._kept[check_integer("part", part, 0, len(self._kept) - 1)]
 
     def _add(self, y: Any) -> None:
         """Remember ``y``; merge once more is pending than kept, so that what is kept is not copied at every call."""
-        self._pending.append(y)
-        kept = sum(priority.numel() for _, priority in filter(None, self._kept))
-        if sum(pending.batch_size[0] for pending in self._pending) > kept:
-            self._merge()
+        with self._lock:
+            self._pending.append(y)
+            kept = sum(priority.numel() for _, priority in filter(None, self._kept))
+            if sum(pending.batch_size[0] for pending in self._pending) > kept:
+                self._merge()
 
     def _merge(self) -> None:
         """Keep, of what is kept and what is pending, the states of lowest priority; equal states once."""

@@ -4,6 +4,6 @@ Ray trusts all who reach its ports: whoever does can run code on every machine o
 listens on the loopback address alone; a cluster of several machines belongs into a network of its own.
 """
 
-from torchrl_pomdp.distributed.ray_workers import RayWorkers, WorkerError
+from torchrl_pomdp.distributed.ray_workers import RayWorkers
 
-__all__ = ["RayWorkers", "WorkerError"]
+__all__ = ["RayWorkers"]

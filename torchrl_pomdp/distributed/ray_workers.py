@@ -14,19 +14,15 @@ from torchrl.record.loggers import Logger
 
 from torchrl_pomdp.checks import check_integer, check_text
 from torchrl_pomdp.distributed.part_actor import PartActor
-from torchrl_pomdp.workers import PartTraining, Task, Training, Workers
+from torchrl_pomdp.workers import PartTraining, Task, Training, WorkerError, Workers
 
-__all__ = ["RayWorkers", "WorkerError"]
+__all__ = ["RayWorkers"]
 
 # Tasks that are given out for each worker: one that it does, and one that waits, so that no worker does.
 _AHEAD = 2
 # How often a task of a worker that dies is done again: with the same seeds, so that nothing changes.
 _RETRIES = 5
 _LOOPBACK = "127.0.0.1"
-
-
-class WorkerError(RuntimeError):
-    """Work has failed elsewhere; the message says which, and why."""
 
 
 class RayWorkers(Workers):
@@ -82,6 +78,11 @@ class RayWorkers(Workers):
         if self._own:
             ray.shutdown()
             self._own = False
+
+    def check_device(self, device: torch.device) -> None:
+        """See :meth:`Workers.check_device`: they compute on CPUs."""
+        if device.type != "cpu":
+            raise ValueError(f"workers of a Ray cluster compute on CPUs, got a model on {device}")
 
     def tasks(self, function: Task, shared: Any, items: Sequence[Any], name: Callable[[Any], str]) -> Iterator[tuple[Any, Any]]:
         """See :meth:`Workers.tasks`."""

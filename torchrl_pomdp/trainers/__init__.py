@@ -2,6 +2,7 @@
 
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.trainers.architecture import make_networks, make_values
+from torchrl_pomdp.trainers.asynchronous import AsynchronousIteration, Version
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from torchrl_pomdp.trainers.parts import PartRecord, train_part
 from torchrl_pomdp.trainers.peers import compare_peers
@@ -11,6 +12,7 @@ from torchrl_pomdp.trainers.ppo import ppo
 from torchrl_pomdp.trainers.recipes import api, papi_nt, papi_t, r_nt, r_t
 
 __all__ = [
+    "AsynchronousIteration",
     "Checkpoint",
     "Evaluate",
     "Improve",
@@ -18,6 +20,7 @@ __all__ = [
     "PartRecord",
     "PolicyIteration",
     "PolicyIterationConfig",
+    "Version",
     "api",
     "compare_peers",
     "load_checkpoint",

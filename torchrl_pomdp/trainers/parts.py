@@ -17,6 +17,7 @@ from torchrl.record.loggers import Logger
 from torchrl.trainers import DefaultOptimizationStepper, Trainer
 
 from torchrl_pomdp.checks import check_flag, check_instance, check_seed, check_text
+from torchrl_pomdp.collectors.labels import LabelCollector
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.modules.networks import LocalNetwork
@@ -53,6 +54,12 @@ class PartRecord:
     def to_dict(self) -> dict[str, Any]:
         """All numbers, for JSON."""
         return asdict(self)
+
+    @classmethod
+    def of(cls, collector: LabelCollector, trained: Trained) -> PartRecord:
+        """The record of a part whose states a collector has labelled, in one batch."""
+        made = collector.requested_frames_per_batch, collector.simulated_steps, collector.seconds
+        return cls(*made, trained.seconds, trained.losses)
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ from torchrl_pomdp.trainers.parts import PartImages, PartJob, PartRecord
 from torchrl_pomdp.trainers.plan import Evaluate, Improve, Step, checked_plan
 from torchrl_pomdp.workers import LOCAL, Training, Workers
 
-__all__ = ["Iteration", "PolicyIteration"]
+__all__ = ["Iteration", "PolicyIteration", "judge"]
 
 # The record of whose folder it is.
 _RECORD = "policy-iteration.json"
@@ -155,6 +155,7 @@ class PolicyIteration:
         self.progress = check_flag("progress", progress)
         self.on_labels = None if on_labels is None else check_callable("on_labels", on_labels)
         self.workers = check_instance("workers", workers, Workers)
+        workers.check_device(problem.model.device)
         self._scale = problem.pessimistic_cost
         # Agents that decide in turn cannot change places.
         keep_order = config.multiagent and problem.model.num_agents > 1
@@ -197,7 +198,7 @@ class PolicyIteration:
             policy = PartitionedPolicy(local).eval()
             costs = self._validate(policy, f"iteration {number}")
             comparison = compare(costs, best_costs)
-            accepted, reason = _judge(comparison)
+            accepted, reason = judge(comparison)
             if accepted:
                 self.best, self._values, best_costs = policy, values, costs
             yield Iteration(number, policy, PartitionedValue(values).eval(), accepted, reason, comparison, records)
@@ -279,13 +280,7 @@ class PolicyIteration:
         records = {}
         for part, trained in self.workers.trained(trainings).items():
             networks[part].load_state_dict(trained.weights)
-            records[f"{name}-part-{part}"] = PartRecord(
-                collectors[part].requested_frames_per_batch,
-                collectors[part].simulated_steps,
-                collectors[part].seconds,
-                trained.seconds,
-                trained.losses,
-            )
+            records[f"{name}-part-{part}"] = PartRecord.of(collectors[part], trained)
         if path is not None and cache is not None:
             states = {str(part): network.state_dict() for part, network in networks.items()}
             content = {"networks": states, "records": json.dumps({key: r.to_dict() for key, r in records.items()})}
@@ -373,7 +368,7 @@ class PolicyIteration:
         return (slot * len(_PURPOSES) + _PURPOSES.index(purpose)) % 2**63
 
 
-def _judge(comparison: Comparison) -> tuple[bool, str]:
+def judge(comparison: Comparison) -> tuple[bool, str]:
     """Whether a policy is accepted against the best one so far, and why; costs may be negative."""
     low, high = comparison.difference.interval
     accepted = high < 0.0

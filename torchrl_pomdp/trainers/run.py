@@ -24,8 +24,9 @@ from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import PartitionedValue, Policy
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.trainers.architecture import is_multiagent
+from torchrl_pomdp.trainers.asynchronous import AsynchronousIteration
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
-from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration
+from torchrl_pomdp.trainers.policy_iteration import Iteration
 from torchrl_pomdp.trainers.recipes import api, multiagent_rollouts, papi_nt, papi_t, r_nt, r_t
 from torchrl_pomdp.workers import LOCAL, Workers
 
@@ -77,6 +78,10 @@ class TrainingRun:
     online_trajectories: int = 10
     """Simulated trajectories of each control in online rollout."""
 
+    staleness: int | None = None
+    """How many versions a part may be ahead of the last one: asynchronous policy iteration, see
+    :class:`~torchrl_pomdp.trainers.AsynchronousIteration`. None: all parts together, and a seed gives the same result again."""
+
     def __post_init__(self) -> None:
         check_instance("problem", self.problem, Problem)
         check_choice("algorithm", self.algorithm, ALGORITHMS)
@@ -88,6 +93,8 @@ class TrainingRun:
         check_integer("states", self.states, 1, MAX_STATES)
         check_integer("online_states", self.online_states, 0, MAX_STATES)
         check_integer("online_trajectories", self.online_trajectories, 1, 10**6)
+        if self.staleness is not None:
+            check_integer("staleness", self.staleness, 0, 10**6)
 
     def to_dict(self) -> dict[str, Any]:
         """All numbers and names, for JSON; the problem by its name and its spec."""
@@ -146,7 +153,7 @@ class TrainingRun:
         check_callable("report", report)
         if on_labels is not None:
             check_callable("on_labels", on_labels)
-        check_instance("workers", workers, Workers)
+        check_instance("workers", workers, Workers).check_device(self.problem.model.device)
         identity = _identity(self)
         path = open_run_folder(folder, identity)
         execution = _Execution(self, self.problem, path, identity, progress, report, on_labels, workers)
@@ -200,7 +207,7 @@ class _Execution:
         """Carry out the iterations, keep and evaluate their policies; name and policy of the best one."""
         run = self.run
         best = run.base
-        training = ALGORITHMS[run.algorithm](
+        together = ALGORITHMS[run.algorithm](
             self.problem,
             run.config,
             base,
@@ -210,6 +217,7 @@ class _Execution:
             on_labels=self.on_labels,
             workers=self.workers,
         )
+        training = together if run.staleness is None else AsynchronousIteration(together, run.staleness)
         untrained_value = PartitionedValue([self.problem.pessimistic_cost] * self.problem.partition.num_parts)
         untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, base, untrained_value)
         if not (self.folder / "best.pt").is_file():
@@ -224,8 +232,8 @@ class _Execution:
             if iteration.accepted:
                 self._keep("best.pt", checkpoint)
                 best = name
-            if iteration.number == 1:
-                self._compare_truncated(training, base, iteration)
+            if iteration.number == 1 and together.plan[-1].truncation is not None:
+                self._compare_truncated(base, iteration.value)
             self._compare(name, iteration.policy, run.states)
             summaries.append(_summary(iteration))
             write_json(self.folder / "iterations.json", summaries)
@@ -233,11 +241,10 @@ class _Execution:
             self._keep("best.pt", untrained)
         return best, training.best
 
-    def _compare_truncated(self, training: PolicyIteration, base: TensorDictModuleBase, iteration: Iteration) -> None:
+    def _compare_truncated(self, base: TensorDictModuleBase, value: PartitionedValue) -> None:
         """Evaluate what the networks of the startgame have learnt from, played online, where simulations are cut."""
-        if training.plan[-1].truncation is not None:
-            truncated = r_t(self.problem, base, iteration.value, trajectories=self.run.online_trajectories)
-            self._compare(f"R-T of {self.run.base}", truncated, self.run.states)
+        truncated = r_t(self.problem, base, value, trajectories=self.run.online_trajectories)
+        self._compare(f"R-T of {self.run.base}", truncated, self.run.states)
 
     def _keep(self, name: str, checkpoint: Checkpoint) -> None:
         self.check_folder()
