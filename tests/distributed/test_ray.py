@@ -1,0 +1,300 @@
+"""Policy iteration on a Ray cluster gives what one process gives, whatever dies meanwhile."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from ray.exceptions import OutOfMemoryError
+
+from torchrl_pomdp import evaluation
+from torchrl_pomdp.collectors import StateMemory, labels, memory
+from torchrl_pomdp.config import PolicyIterationConfig
+from torchrl_pomdp.distributed import RayWorkers, ray_workers
+from torchrl_pomdp.envs import FunctionPartition
+from torchrl_pomdp.modules import Myopic
+from torchrl_pomdp.problems import Problem, make_problem
+from torchrl_pomdp.trainers import AsynchronousIteration, papi_nt, papi_t
+from torchrl_pomdp.workers import LOCAL, WorkerError
+
+CONFIG = PolicyIterationConfig(
+    iterations=1, samples_per_part=300, value_samples=200, validation_states=150, epochs=1, least_steps=40
+)
+TWICE = replace(CONFIG, iterations=2)
+DRIVER = os.getpid()
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A cluster of three CPUs, which the tests' workers share."""
+    with RayWorkers(num_workers=3) as workers:
+        yield workers
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Blocks so small that each worker has several."""
+    monkeypatch.setattr(labels, "_BLOCK", 512)
+    monkeypatch.setattr(memory, "_BLOCK", 1024)
+
+
+def tiger():
+    """The tiger, with a part for beliefs that are sure; they come first."""
+    known = make_problem("tiger")
+    sure = FunctionPartition(("unsure", "sure"), lambda y: (y["belief"].amax(-1) > 0.9).long(), stages=((1,), (0,)))
+    model = known.model.with_partition(sure)
+    return Problem(model, known.start, base_policies={"myopic": Myopic(model)})
+
+
+def weights(module):
+    return [p.tolist() for p in module.parameters()]
+
+
+def carried_out(workers, recipe=papi_nt, base=None, config=CONFIG, **options):
+    problem = tiger()
+    return list(recipe(problem, config, base or problem.base_policies["myopic"], workers=workers, **options))
+
+
+def assert_same(found, expected):
+    for one, other in zip(found, expected, strict=True):
+        assert weights(one.policy) == weights(other.policy)
+        assert weights(one.value) == weights(other.value)
+        assert (one.accepted, one.reason, one.comparison) == (other.accepted, other.reason, other.comparison)
+        steps = [{name: r.simulated_steps for name, r in each.records.items()} for each in (one, other)]
+        assert steps[0] == steps[1]
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return carried_out(LOCAL)
+
+
+@pytest.fixture(scope="module")
+def with_values():
+    return carried_out(LOCAL, papi_t, config=TWICE)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_synchronous_is_local_to_the_last_bit(cluster, small, monkeypatch, count, tmp_path, with_values):
+    monkeypatch.setattr(cluster, "num_workers", count)
+    assert_same(carried_out(cluster, papi_t, config=TWICE, folder=tmp_path / "run"), with_values)
+    restored = carried_out(LOCAL, papi_t, config=TWICE, folder=tmp_path / "run")
+    assert_same(restored, with_values)
+
+
+def test_labels_do_not_depend_on_who_is_done_first(cluster, small, expected):
+    myopic = tiger().base_policies["myopic"]
+
+    def slow(y):
+        """Takes longer for some blocks than for others."""
+        if os.getpid() != DRIVER:
+            time.sleep(0.002 * (y["belief"].square().sum().item() * 1000 % 7))
+        return myopic(y)
+
+    slow.in_keys, slow.out_keys = myopic.in_keys, myopic.out_keys
+    assert_same(carried_out(cluster, base=slow), carried_out(LOCAL, base=slow))
+
+
+def test_visits_and_evaluations_are_shared_out(cluster, small):
+    problem, keys = make_problem("line3"), torch.arange(300)
+    greedy = problem.base_policies["greedy"]
+    own, other = StateMemory(problem.model), StateMemory(problem.model)
+    own.visit(greedy, problem.start, keys)
+    other.visit(greedy, problem.start, keys, workers=cluster)
+    assert own.count(4) == other.count(4) > 0
+    draws = [each.generator(4)(torch.arange(50)) for each in (own, other)]
+    assert torch.equal(draws[0]["belief"], draws[1]["belief"])
+    options = {"num_states": 200, "first": 7, "seed": 3}
+    costs = [evaluation.discounted_costs(problem.model, greedy, problem.start, workers=w, **options) for w in (LOCAL, cluster)]
+    assert torch.equal(*costs)
+
+
+# ---- what dies -------------------------------------------------------------------------------------------------------
+
+
+def test_a_killed_worker_changes_nothing(cluster, small, expected, tmp_path):
+    myopic, marker = tiger().base_policies["myopic"], tmp_path / "killed"
+
+    def mortal(y):
+        """Kills its process once, in the middle of a task."""
+        if os.getpid() != DRIVER and not marker.exists():
+            marker.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return myopic(y)
+
+    mortal.in_keys, mortal.out_keys = myopic.in_keys, myopic.out_keys
+    found = carried_out(cluster, base=mortal)
+    assert marker.exists()
+    assert_same(found, expected)
+
+
+def processes(name):
+    """Numbers of the processes whose command line starts so."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if path.read_bytes().startswith(name.encode()):
+                found.append(int(path.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def test_a_killed_actor_changes_nothing(cluster, small):
+    config = replace(CONFIG, least_steps=400)
+    expected, killed = carried_out(LOCAL, config=config), []
+
+    def kill():
+        while not killed:
+            for process in processes("ray::PartActor.train")[:1]:
+                os.kill(process, signal.SIGKILL)
+                killed.append(process)
+            time.sleep(0.01)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    found = carried_out(cluster, config=config)
+    assert killed
+    assert_same(found, expected)
+
+
+SCRIPT = "import sys, test_ray; test_ray.on_a_cluster_of_its_own(sys.argv[1])"
+COMMAND = ("-m", "torchrl_pomdp.cli", "train", "tiger", "--states", "20", "--validation-states", "50", "--backend", "ray")
+NUMBERS = ("--samples-per-part", "300", "--iterations", "2", "--least-steps", "300", "--epochs", "1", "--workers", "2")
+
+
+def on_a_cluster_of_its_own(folder):
+    with RayWorkers(num_workers=2) as workers:
+        carried_out(workers, config=TWICE, folder=Path(folder))
+
+
+def wait_for(condition, seconds=90):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it takes too long"
+        time.sleep(0.05)
+
+
+def descendants(process):
+    """All processes that a process has started, directly or not."""
+    children = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            number, parent = int(path.parent.name), int(path.read_text().rsplit(")", 1)[1].split()[1])
+        except OSError:
+            continue
+        children.setdefault(parent, []).append(number)
+    found, waiting = [], [process]
+    while waiting:
+        own = children.get(waiting.pop(), [])
+        found += own
+        waiting += own
+    return found
+
+
+def alive(processes):
+    """Those that are there and no zombies; Ray's agents look once a minute whether their raylet is."""
+    found = []
+    for number in processes:
+        try:
+            dead = Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+            agent = b"Agent" in Path(f"/proc/{number}/cmdline").read_bytes()
+        except OSError:
+            continue
+        if not dead and not agent:
+            found.append(number)
+    return found
+
+
+def interrupted(arguments, folder, how):
+    """Start Python, end it in the middle of a step, and see that nothing is left of its cluster."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
+    driver = subprocess.Popen(
+        [sys.executable, *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    wait_for(lambda: list(folder.glob("iteration-1/*.labels/*/*.pt")) or list(folder.glob("iteration-1/*.pt")))
+    everything = descendants(driver.pid)
+    assert len(everything) > 3
+    driver.send_signal(how)
+    driver.communicate(timeout=60)
+    assert driver.returncode != 0
+    wait_for(lambda: not alive(everything), 30)
+
+
+def test_a_killed_driver_goes_on(cluster, tmp_path):
+    interrupted(("-c", SCRIPT, str(tmp_path / "run")), tmp_path / "run", signal.SIGKILL)
+    assert not (tmp_path / "run/iteration-2/2-improve.pt").exists()
+    assert_same(carried_out(cluster, config=TWICE, folder=tmp_path / "run"), carried_out(LOCAL, config=TWICE))
+
+
+def test_an_interrupt_of_the_command_releases_ray(tmp_path):
+    folder = tmp_path / "run"
+    interrupted((*COMMAND, *NUMBERS, "--out", str(folder)), folder, signal.SIGINT)
+
+
+# ---- what fails ------------------------------------------------------------------------------------------------------
+
+
+def test_errors_say_which_work_has_failed(cluster, small, monkeypatch):
+    myopic = tiger().base_policies["myopic"]
+
+    def broken(y):
+        if os.getpid() != DRIVER and y.batch_size.numel() > 1:
+            raise ArithmeticError("no idea")
+        return myopic(y)
+
+    config = replace(CONFIG, visited_share=0.0)
+    monkeypatch.setattr("torchrl_pomdp.trainers.policy_iteration.PolicyIteration._visit", lambda self, *args: None)
+    monkeypatch.setattr("torchrl_pomdp.trainers.policy_iteration.PolicyIteration._validate", lambda *args: torch.zeros(2))
+    with pytest.raises(WorkerError, match=r"label iteration-1/1-improve, part 1, states 0 … 63: ArithmeticError: no idea"):
+        carried_out(cluster, base=broken, config=config)
+
+
+def test_memory_that_runs_out_is_named(cluster, monkeypatch):
+    def out(reference):
+        raise OutOfMemoryError("a worker was killed")
+
+    monkeypatch.setattr(ray_workers.ray, "get", out)
+    with pytest.raises(WorkerError, match=r"the work: OutOfMemoryError: .*a worker was killed"):
+        cluster._get(None, "the work")
+
+
+def test_a_worker_that_dies_again_and_again_is_given_up(cluster):
+    def dies(shared, item):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    with pytest.raises(WorkerError, match="number 7: WorkerCrashedError"):
+        list(cluster.tasks(dies, None, [7], lambda item: f"number {item}"))
+
+
+def test_models_elsewhere_are_refused(cluster):
+    with pytest.raises(ValueError, match="workers of a Ray cluster compute on CPUs, got a model on meta"):
+        cluster.check_device(torch.device("meta"))
+
+
+# ---- parts at their own pace -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("staleness", [0, 1])
+def test_versions_keep_to_the_bound(cluster, small, staleness):
+    problem = tiger()
+    config = replace(CONFIG, iterations=3)
+    run = AsynchronousIteration(papi_nt(problem, config, problem.base_policies["myopic"], workers=cluster), staleness)
+    iterations = list(run)
+    assert [iteration.number for iteration in iterations] == [1, 2, 3]
+    made = sorted((version.part, version.number) for version in run.published)
+    assert made == [(part, number) for part in range(2) for number in (1, 2, 3)]
+    assert all(version.number - 1 - min(version.used) <= staleness for version in run.published)
+
+
+def test_it_is_an_extra_that_costs_nothing_otherwise():
+    text = "import sys, torchrl_pomdp; print('ray' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", text], capture_output=True, text=True).stdout.strip() == "False"
