@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from benchmarks import decisions, engine, online, robots, rocksample, searches, tabular, where
+from benchmarks import decisions, engine, online, robots, rocksample, scaling, searches, tabular, where
 from benchmarks.harness import Table, write
 
 FOLDER = Path(__file__).parent
@@ -15,7 +15,7 @@ BENCHMARKS = {
     for function in (
         engine.trajectories, engine.looks, engine.batch, engine.network, engine.router, engine.locations, engine.memory,
         engine.env_step, tabular.updates, decisions.decision, decisions.labels, decisions.adaptive, decisions.expectation,
-        online.online, searches.searches, robots.robots,
+        online.online, searches.searches, robots.robots, scaling.scaling,
         where.profile, rocksample.rocksample_updates, rocksample.rocksample_rewards,
     )
 }  # fmt: skip

@@ -46,6 +46,7 @@ from _valid import (
     model,
     quick_reproduce,
     repair_model,
+    some_workers,
     state,
     written,
 )
@@ -77,6 +78,7 @@ REPORTS = {
         terminal_cost=at_once((ZeroCost(), terminal_costs())),
         progress=(False, flags()),
         name=("evaluate", texts()),
+        workers=some_workers(),
     ),
     "evaluation.estimate": lambda _: case(evaluation.estimate, values=(torch.ones(2), tensors(torch.ones(2), free=True))),
     "evaluation.compare": lambda _: case(

@@ -45,6 +45,7 @@ from _valid import (
     network,
     on_tensordict,
     saved,
+    some_workers,
     start,
     state,
     value_network,
@@ -86,6 +87,7 @@ COLLECTORS = {
         keys=(KEYS, keys()),
         exploration=(0.0, numbers("[0, 1]")),
         max_steps=(3, integers(1)),
+        workers=some_workers(),
     ),
     "collectors.StateMemory.count": lambda _: case(visited().count, part=(1, integers(0, 5))),
     "collectors.StateMemory.generator": lambda _: case(
@@ -174,6 +176,12 @@ TRAINERS = {
         logger=(None, objects()),
         progress=(False, flags()),
         on_labels=callback(),
+        workers=some_workers(),
+    ),
+    "trainers.AsynchronousIteration": lambda _: case(
+        trainers.AsynchronousIteration,
+        iteration=(trainers.papi_nt(a_problem()[0], config(), greedy()), objects(trainers.PolicyIteration)),
+        staleness=(1, integers(0)),
     ),
     "trainers.papi_nt": lambda _: an_algorithm(trainers.papi_nt),
     "trainers.papi_t": lambda _: an_algorithm(trainers.papi_t),
@@ -240,6 +248,7 @@ TRAINERS = {
         states=(8, integers(1)),
         online_states=(0, integers(0)),
         online_trajectories=(1, integers(1)),
+        staleness=(None, integers(0)),
     ),
     "trainers.run.TrainingRun.carry_out": lambda folder: case(
         run.TrainingRun(a_problem()[0], "API", config=config(), states=8, online_states=0, online_trajectories=1).carry_out,
@@ -247,6 +256,7 @@ TRAINERS = {
         progress=(False, flags()),
         report=callback(),
         on_labels=callback(),
+        workers=some_workers(),
     ),
 }
 

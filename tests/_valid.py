@@ -33,6 +33,7 @@ from torchrl_pomdp.envs.repair import RepairModel
 from torchrl_pomdp.modules import FlatEncoder, OnEntering, RolloutPolicy, ZeroCost
 from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
 from torchrl_pomdp.trainers import checkpoint, run
+from torchrl_pomdp.workers import LOCAL, Workers
 
 Argument = tuple[Any, list[Hostile]]
 """A valid value, and values that are refused."""
@@ -233,6 +234,10 @@ def a_config() -> Argument:
 
 def callback() -> Argument:
     return (lambda *_: None), not_callable()
+
+
+def some_workers() -> Argument:
+    return LOCAL, objects(Workers)
 
 
 def simulation() -> dict[str, Argument]:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torchrl_pomdp.envs import FixedBelief, TabularModel
 from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
 from torchrl_pomdp.problems import tiger
-from torchrl_pomdp.trainers.policy_iteration import _judge
+from torchrl_pomdp.trainers.policy_iteration import judge
 
 
 def sample(mean, spread=3.0, count=400, seed=0):
@@ -25,7 +25,7 @@ def sample(mean, spread=3.0, count=400, seed=0):
 def test_cheaper_policies_are_accepted_and_dearer_ones_are_not(base, change):
     baseline = sample(base)
     comparison = compare(baseline + sample(change, spread=2.0, seed=1), baseline)
-    accepted, reason = _judge(comparison)
+    accepted, reason = judge(comparison)
     assert accepted == (change < 0)
     assert comparison.difference.mean == pytest.approx(change)
     assert comparison.difference.standard_error == pytest.approx(2.0 / 20)
@@ -37,7 +37,7 @@ def test_cheaper_policies_are_accepted_and_dearer_ones_are_not(base, change):
 @pytest.mark.parametrize("base", [-10.5, 0.0, 10.5])
 def test_differences_within_the_noise_are_not_accepted(base, change):
     baseline = sample(base)
-    accepted, reason = _judge(compare(baseline + sample(change, spread=2.0, seed=1), baseline))
+    accepted, reason = judge(compare(baseline + sample(change, spread=2.0, seed=1), baseline))
     assert not accepted
     assert "not lower with confidence" in reason
 
@@ -48,7 +48,7 @@ def test_a_constant_on_all_costs_changes_no_verdict(offset, change, seed):
     baseline, costs = sample(0.0, seed=seed), sample(change, seed=seed + 1)
     plain, moved = compare(costs, baseline), compare(costs + offset, baseline + offset)
     if abs(plain.difference.interval[1]) > 1e-6:
-        assert _judge(moved)[0] == _judge(plain)[0]
+        assert judge(moved)[0] == judge(plain)[0]
     assert moved.difference.mean == pytest.approx(plain.difference.mean, abs=1e-6)
 
 
@@ -66,7 +66,7 @@ def test_a_constant_on_all_stage_costs_changes_no_verdict():
             sure: discounted_costs(model, listen_until(sure), start, num_states=300, max_steps=100) for sure in (0.8, 0.95, 1.0)
         }
         pairs = [compare(costs[one], costs[other]) for one in costs for other in costs]
-        verdicts.append([_judge(pair)[0] for pair in pairs])
+        verdicts.append([judge(pair)[0] for pair in pairs])
         differences.append([pair.difference.mean for pair in pairs])
         assert all(pair.ratio is None for pair in pairs) == (offset < 0)
     assert verdicts[0] == verdicts[1] == verdicts[2]
@@ -158,11 +158,11 @@ def test_samples_that_are_not_paired_are_refused():
 def test_single_values_have_no_error_and_are_not_accepted():
     comparison = compare(torch.tensor([1.0]), torch.tensor([9.0]))
     assert math.isnan(comparison.difference.standard_error)
-    assert not _judge(comparison)[0]
+    assert not judge(comparison)[0]
 
 
 def test_single_precision_costs_are_compared_in_double_precision():
     baseline = torch.full((1000,), 1e7) + torch.arange(1000)
     comparison = compare(baseline - 1, baseline)
     assert comparison.difference.mean == -1.0
-    assert _judge(comparison)[0]
+    assert judge(comparison)[0]

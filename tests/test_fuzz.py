@@ -52,7 +52,7 @@ EXEMPT = {
     "abstract, tried by what they are bases of": "envs.Partition modules.Encoder modules.AgentEncoder modules.ClosedFormCost "
     "modules.Truncation",
     "made by the library, not by its users": "*.Comparison *.Estimate *.Iteration *.PartRecord *.Effort *.DamagedFileError "
-    "*.PartitionReport *.Change *.Decision *.Interval *.Solution *.ErrorBounds",
+    "*.PartitionReport *.Change *.Version *.Decision *.Interval *.Solution *.ErrorBounds",
     "run at every belief step, on what was checked before": "noise.fold noise.uniform noise.fingerprint noise.permuted",
     "of any object": "identity.*",
     "of no argument": "changes.model_changes",

@@ -72,7 +72,7 @@ class Workers(ABC):
 
     @abstractmethod
     def tasks(self, function: Task, shared: Any, items: Sequence[Any], name: Callable[[Any], str]) -> Iterator[tuple[Any, Any]]:
-        """Carry out ``function(shared, item)`` for every item.
+        """Carry out ``function(shared, item)`` for every item; some are begun at once.
 
         Args:
             function: the task, a function of a module.
@@ -80,7 +80,7 @@ class Workers(ABC):
             items: the tasks' own arguments.
             name: what an item is called in errors.
 
-        Yields:
+        Returns:
             for each item, in order, a handle of the result, and the report.
         """
 

@@ -9,26 +9,24 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from _tiger import CONFIG, TWICE, assert_same, carried_out, tiger
 from ray.exceptions import OutOfMemoryError
+from torchrl.collectors.distributed import RayCollector
 
 from torchrl_pomdp import evaluation
-from torchrl_pomdp.collectors import StateMemory, labels, memory
-from torchrl_pomdp.config import PolicyIterationConfig
+from torchrl_pomdp.collectors import PartSampler, RolloutImprovement, StateMemory, labels, memory
 from torchrl_pomdp.distributed import RayWorkers, ray_workers
-from torchrl_pomdp.envs import FunctionPartition
-from torchrl_pomdp.modules import Myopic
-from torchrl_pomdp.problems import Problem, make_problem
+from torchrl_pomdp.envs import BeliefEnv
+from torchrl_pomdp.modules import RolloutPolicy
+from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import AsynchronousIteration, papi_nt, papi_t
 from torchrl_pomdp.workers import LOCAL, WorkerError
 
-CONFIG = PolicyIterationConfig(
-    iterations=1, samples_per_part=300, value_samples=200, validation_states=150, epochs=1, least_steps=40
-)
-TWICE = replace(CONFIG, iterations=2)
 DRIVER = os.getpid()
 
 
@@ -46,32 +44,6 @@ def small(monkeypatch):
     monkeypatch.setattr(memory, "_BLOCK", 1024)
 
 
-def tiger():
-    """The tiger, with a part for beliefs that are sure; they come first."""
-    known = make_problem("tiger")
-    sure = FunctionPartition(("unsure", "sure"), lambda y: (y["belief"].amax(-1) > 0.9).long(), stages=((1,), (0,)))
-    model = known.model.with_partition(sure)
-    return Problem(model, known.start, base_policies={"myopic": Myopic(model)})
-
-
-def weights(module):
-    return [p.tolist() for p in module.parameters()]
-
-
-def carried_out(workers, recipe=papi_nt, base=None, config=CONFIG, **options):
-    problem = tiger()
-    return list(recipe(problem, config, base or problem.base_policies["myopic"], workers=workers, **options))
-
-
-def assert_same(found, expected):
-    for one, other in zip(found, expected, strict=True):
-        assert weights(one.policy) == weights(other.policy)
-        assert weights(one.value) == weights(other.value)
-        assert (one.accepted, one.reason, one.comparison) == (other.accepted, other.reason, other.comparison)
-        steps = [{name: r.simulated_steps for name, r in each.records.items()} for each in (one, other)]
-        assert steps[0] == steps[1]
-
-
 @pytest.fixture(scope="module")
 def expected():
     return carried_out(LOCAL)
@@ -82,9 +54,8 @@ def with_values():
     return carried_out(LOCAL, papi_t, config=TWICE)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_synchronous_is_local_to_the_last_bit(cluster, small, monkeypatch, count, tmp_path, with_values):
-    monkeypatch.setattr(cluster, "num_workers", count)
+def test_synchronous_is_local_to_the_last_bit(cluster, small, tmp_path, with_values):
+    assert cluster.num_workers == 3
     assert_same(carried_out(cluster, papi_t, config=TWICE, folder=tmp_path / "run"), with_values)
     restored = carried_out(LOCAL, papi_t, config=TWICE, folder=tmp_path / "run")
     assert_same(restored, with_values)
@@ -275,6 +246,14 @@ def test_a_worker_that_dies_again_and_again_is_given_up(cluster):
         list(cluster.tasks(dies, None, [7], lambda item: f"number {item}"))
 
 
+def test_a_running_cluster_has_the_workers_that_it_has(cluster):
+    with RayWorkers() as same:
+        assert same.num_workers == 3
+    with pytest.raises(ValueError, match="num_workers is for a cluster that is started here, got 2 for one that is running"):
+        RayWorkers(num_workers=2)
+    assert list(cluster.tasks(lambda shared, item: (item, item), None, [1], str)), "the cluster is still there"
+
+
 def test_models_elsewhere_are_refused(cluster):
     with pytest.raises(ValueError, match="workers of a Ray cluster compute on CPUs, got a model on meta"):
         cluster.check_device(torch.device("meta"))
@@ -293,6 +272,34 @@ def test_versions_keep_to_the_bound(cluster, small, staleness):
     made = sorted((version.part, version.number) for version in run.published)
     assert made == [(part, number) for part in range(2) for number in (1, 2, 3)]
     assert all(version.number - 1 - min(version.used) <= staleness for version in run.published)
+
+
+def test_torchrls_own_collector_takes_rollout_improvement(cluster):
+    """Two remote collectors share the work; what they give is what one gives."""
+    problem = tiger()
+    policy, make = problem.base_policies["myopic"], partial(BeliefEnv, problem.model, problem.start)
+    options = {
+        "states": PartSampler(dict(enumerate(problem.training)), seed=0),
+        "label": partial(RolloutPolicy, trajectories=2),
+    }
+    sizes = {"frames_per_batch": 32, "total_frames": 64}
+    alone = list(RolloutImprovement(make(), policy, **options, **sizes))
+    collector = RayCollector(
+        [make, make],
+        policy,
+        collector_class=RolloutImprovement,
+        collector_kwargs=[{**options, "num_workers": 2} for _ in range(2)],
+        num_collectors=2,
+        sync=True,
+        remote_configs={"num_cpus": 0.5},
+        **sizes,
+    )
+    collector.update_policy_weights_(policy)
+    together = list(collector)
+    collector.shutdown(shutdown_ray=False)
+    for one, other in zip(alone, together, strict=True):
+        assert torch.equal(one["collector", "traj_ids"], other.reshape(-1)["collector", "traj_ids"])
+        assert torch.equal(one["q_factors"], other.reshape(-1)["q_factors"])
 
 
 def test_it_is_an_extra_that_costs_nothing_otherwise():

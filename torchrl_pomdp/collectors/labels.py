@@ -144,7 +144,7 @@ class LabelCollector(Collector):
         return batch.set(("collector", "mask"), torch.ones_like(numbers, dtype=torch.bool))
 
     def blocks(self, workers: Workers, summary: Summary) -> Iterator[Block]:
-        """The next batch block by block, labelled by ``workers``; nothing keeps all of it in memory.
+        """The next batch block by block, labelled by ``workers``, who begin at once; nothing keeps all of it in memory.
 
         Args:
             workers: who labels.
@@ -161,39 +161,41 @@ class LabelCollector(Collector):
         return torch.arange(first, first + size, device=self.env.device)
 
     def _blocks(self, numbers: Tensor, workers: Workers, summary: Summary | None) -> Iterator[Block]:
-        """Blocks of labelled states with the given numbers, in order."""
+        """Blocks of labelled states with the given numbers, in order; some are given out at once."""
         pieces = numbers.split(max(1, rows_at_once(_BLOCK, numbers.device) // workers.pieces))
-        with progress_bar(len(numbers), "state", self.name, self.progress) as bar:
-            for own, (handle, report, cached) in zip(pieces, self._labelled(pieces, workers, summary), strict=True):
+        paths = [None if self.cache is None else self.cache / f"{int(n[0]):012d}-{len(n)}.pt" for n in pieces]
+        there = [path is not None and path.is_file() for path in paths]
+        label = partial(workers.tasks, label_states, (self.env.model, self.labeller, self.states, summary), name=self._title)
+        made = label([own for own, found in zip(pieces, there, strict=True) if not found])
+
+        def labelled() -> Iterator[tuple[Any, dict[str, Any], bool]]:
+            """Handle and report of each block, and whether it comes from the cache, where this labelling has made it."""
+            owner = "" if self.cache is None else digest([self.labeller, self.states])
+            for own, path, found in zip(pieces, paths, there, strict=True):
+                content = kept(path, f"{owner} {path.name}", self.env.device) if path is not None and found else None
+                if content is not None:
+                    states = TensorDict(content.pop("states"), own.shape, device=self.env.device)
+                    yield workers.put(states), {**content, "summary": summary and summary(states)}, True
+                    continue
+                # A damaged block is made again by itself.
+                handle, report = next(label([own]) if found else made)
+                if path is not None:
+                    took = {key: report[key] for key in ("simulated_steps", "seconds")}
+                    keep(path, f"{owner} {path.name}", {"states": workers.fetch(handle).to_dict(), **took})
+                yield handle, report, False
+
+        return self._counted(pieces, labelled())
+
+    def _counted(self, pieces: Sequence[Tensor], labelled: Iterator[tuple[Any, dict[str, Any], bool]]) -> Iterator[Block]:
+        """The blocks, and what they took is added up and shown."""
+        with progress_bar(sum(map(len, pieces)), "state", self.name, self.progress) as bar:
+            for own, (handle, report, cached) in zip(pieces, labelled, strict=True):
                 self.simulated_steps += report["simulated_steps"]
                 self.seconds += report["seconds"]
                 bar.update(len(own))
                 if self.on_labels is not None:
                     self.on_labels(len(own), cached)
                 yield Block(handle, report["summary"])
-
-    def _labelled(
-        self, pieces: Sequence[Tensor], workers: Workers, summary: Summary | None
-    ) -> Iterator[tuple[Any, dict[str, Any], bool]]:
-        """Handle and report of each block, and whether it comes from the cache, where this labelling has made it."""
-        label = partial(workers.tasks, label_states, (self.env.model, self.labeller, self.states, summary), name=self._title)
-        if self.cache is None:
-            yield from ((handle, report, False) for handle, report in label(pieces))
-            return
-        owner, paths = digest([self.labeller, self.states]), [self.cache / f"{int(n[0]):012d}-{len(n)}.pt" for n in pieces]
-        there = [path.is_file() for path in paths]
-        made = label([own for own, found in zip(pieces, there, strict=True) if not found])
-        for own, path, found in zip(pieces, paths, there, strict=True):
-            content = kept(path, f"{owner} {path.name}", self.env.device) if found else None
-            if content is not None:
-                states = TensorDict(content.pop("states"), own.shape, device=self.env.device)
-                yield workers.put(states), {**content, "summary": summary and summary(states)}, True
-                continue
-            # A damaged block is made again by itself.
-            handle, report = next(label([own]) if found else made)
-            took = {key: report[key] for key in ("simulated_steps", "seconds")}
-            keep(path, f"{owner} {path.name}", {"states": workers.fetch(handle).to_dict(), **took})
-            yield handle, report, False
 
     def _title(self, numbers: Tensor) -> str:
         """What the labelling of a block is called."""

@@ -34,11 +34,11 @@ class RayWorkers(Workers):
     Args:
         address: a running cluster, as ``ray.init`` takes it; None starts one on this machine, reachable from it alone and
             without a dashboard, which is stopped in the end. Where Ray runs in this process already, it is used.
-        num_workers: how many tasks are done at once; None: as many as the cluster has CPUs.
+        num_workers: CPUs of the cluster that is started here, each for one task at a time; None: all of the machine's.
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if ``num_workers`` is not positive.
+        ValueError: if ``num_workers`` is not positive, or given for a cluster that is running.
         ConnectionError: if there is no cluster at the address.
 
     Examples:
@@ -56,11 +56,13 @@ class RayWorkers(Workers):
             check_text("address", address)
         wanted = None if num_workers is None else check_integer("num_workers", num_workers, 1, 10**5)
         self._own = not ray.is_initialized()
+        if wanted is not None and not (self._own and address is None):
+            raise ValueError(f"num_workers is for a cluster that is started here, got {wanted} for one that is running")
         if self._own and address is None:
             ray.init("local", num_cpus=wanted, include_dashboard=False, log_to_driver=False, _node_ip_address=_LOOPBACK)
         elif self._own:
             ray.init(address, log_to_driver=False)
-        self.num_workers = wanted or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        self.num_workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
         self._actors: dict[int, Any] = {}
         self._do: Any = ray.remote(num_returns=2, num_cpus=1, max_retries=_RETRIES)(_do)
 
@@ -86,18 +88,27 @@ class RayWorkers(Workers):
 
     def tasks(self, function: Task, shared: Any, items: Sequence[Any], name: Callable[[Any], str]) -> Iterator[tuple[Any, Any]]:
         """See :meth:`Workers.tasks`."""
-        waiting: deque[tuple[Any, Any, Any]] = deque()
-        left, everyone = deque(items), [ray.put(shared)] if items else []
-        try:
-            while left or waiting:
-                while left and len(waiting) < _AHEAD * self.num_workers:
-                    item = left.popleft()
-                    waiting.append((*self._do.remote(function, everyone, item), item))
-                handle, report, item = waiting.popleft()
-                yield handle, self._get(report, name(item))
-        finally:
-            for _, report, _ in waiting:
-                ray.cancel(report)
+        # The first ones are given out now: where several kinds of tasks are asked for, they are done side by side.
+        everyone, left, waiting = [ray.put(shared)] if items else [], deque(items), deque[tuple[Any, Any, Any]]()
+
+        def give_out() -> None:
+            while left and len(waiting) < _AHEAD * self.num_workers:
+                item = left.popleft()
+                waiting.append((*self._do.remote(function, everyone, item), item))
+
+        def results() -> Iterator[tuple[Any, Any]]:
+            try:
+                while waiting:
+                    handle, report, item = waiting.popleft()
+                    found = self._get(report, name(item))
+                    give_out()
+                    yield handle, found
+            finally:
+                for _, report, _ in waiting:
+                    ray.cancel(report)
+
+        give_out()
+        return results()
 
     def fetch(self, handle: Any) -> Any:
         """See :meth:`Workers.fetch`."""

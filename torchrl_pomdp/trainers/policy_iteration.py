@@ -272,8 +272,9 @@ class PolicyIteration:
         make = partial(self._collector, index, PartitionedPolicy(local), PartitionedValue(values), number, cache)
         trainings = {part: self._training(index, part, network, number) for part, network in networks.items()}
         collectors = {part: make(part) for part in step.parts}
-        for part, collector in collectors.items():
-            for block in collector.blocks(self.workers, self._images.counts):
+        labelled = {part: collector.blocks(self.workers, self._images.counts) for part, collector in collectors.items()}
+        for part, blocks in labelled.items():
+            for block in blocks:
                 for other, training in trainings.items():
                     if block.summary[other]:
                         training.add(part, block.handle)

@@ -1,0 +1,174 @@
+"""Policy iteration on Ray: what it costs here, and by discrete events what a cluster would make of it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from benchmarks.cluster import Costs, simulate
+from benchmarks.harness import Table, seconds, threads
+from benchmarks.setting import linear20, networks
+from torchrl_pomdp.collectors import PartSampler, RolloutImprovement, labels
+from torchrl_pomdp.config import PolicyIterationConfig
+from torchrl_pomdp.envs import BeliefEnv
+from torchrl_pomdp.modules import RolloutPolicy
+from torchrl_pomdp.objectives import ClassificationLoss
+from torchrl_pomdp.trainers.parts import PartImages, PartJob
+from torchrl_pomdp.workers import LOCAL, Workers
+
+# A step of the startgame of linear20: its parts, and the labelled states of each.
+PARTS, STATES = 3, 24_576
+CONFIG = PolicyIterationConfig(samples_per_part=STATES, epochs=1, least_steps=400)
+# Of a cluster: 10 Gbit/s into each machine.
+BANDWIDTH = 1.25e9
+
+
+def scaling(table: Table) -> None:
+    """Labels of a network's rollout (10 trajectories) and training of three parts on Ray, one thread a worker."""
+    from torchrl_pomdp.distributed import RayWorkers
+
+    real = {}
+    with threads(1):
+        for count in (1, 2):
+            with RayWorkers(num_workers=count) as workers:
+                # Processes start, and compiled loops are read.
+                _step(workers)
+                real[count] = _step(workers)
+                costs = _measure(workers, table if count == 2 else Table())
+        _compare(real, _step(LOCAL), costs, table)
+    _extrapolate(costs, table)
+
+
+def _collectors() -> dict[int, RolloutImprovement]:
+    problem, policy = linear20(), networks()
+    return {
+        part: RolloutImprovement(
+            BeliefEnv(problem.model, problem.start),
+            policy,
+            states=PartSampler({part: problem.training[part]}, seed=part),
+            label=partial(RolloutPolicy, trajectories=10),
+            frames_per_batch=STATES,
+        )
+        for part in range(PARTS)
+    }
+
+
+def _step(workers: Workers) -> tuple[float, float]:
+    """Seconds until the labels of a step are there, and until it is done."""
+    images = PartImages(linear20().partition, linear20().symmetries)
+    begin = time.perf_counter()
+    trainings = {}
+    for part in range(PARTS):
+        job = PartJob(part, f"part {part}", part, networks().policies[part], ClassificationLoss, images, CONFIG)
+        trainings[part] = workers.training(job, None, False)
+    blocks = {part: collector.blocks(workers, images.counts) for part, collector in _collectors().items()}
+    for part, own in blocks.items():
+        for block in own:
+            for other, training in trainings.items():
+                if block.summary[other]:
+                    training.add(part, block.handle)
+    labelled = time.perf_counter() - begin
+    workers.trained(trainings)
+    return labelled, time.perf_counter() - begin
+
+
+def _nothing(shared: object, item: object) -> tuple[None, None]:
+    return None, None
+
+
+def _measure(workers: Workers, table: Table) -> Costs:
+    """Costs of the parts of a step."""
+    import ray
+
+    size = labels._BLOCK // workers.pieces
+    problem, images = linear20(), PartImages(linear20().partition, linear20().symmetries)
+    collector = _collectors()[0]
+    shared = problem.model, collector.labeller, collector.states, images.counts
+    block, _ = labels.label_states(shared, torch.arange(size))
+    compute = seconds(lambda: labels.label_states(shared, torch.arange(size)))[0]
+    list(workers.tasks(_nothing, None, range(20), str))
+    begin, count = time.perf_counter(), 500
+    results = workers.tasks(_nothing, None, range(count), str)
+    list(results)
+    each = (time.perf_counter() - begin) / count
+    job = PartJob(0, "part", 0, networks().policies[0], ClassificationLoss, images, replace(CONFIG, least_steps=100, epochs=1))
+    data = job.open()
+    begin = time.perf_counter()
+    for _ in range(4):
+        data.add(0, block)
+    add = (time.perf_counter() - begin) / 4
+    trained = job.train(data, None, False)
+    steps = max(100, 4 * 2 * size // CONFIG.batch_size // 2)
+    reference = ray.put(block)
+    fetch = seconds(lambda: ray.get(reference))[0]
+    weights = ray.put(networks())
+    reach = seconds(lambda: ray.get(_reach(ray).remote([weights])), repeats=9)[0]
+    nothing = seconds(lambda: ray.get(_reach(ray).remote([])), repeats=9)[0]
+    table.add("label a block of 2048 states, one core", compute, "s")
+    table.add("a task that does nothing, driver and two workers", 1e3 * each, "ms")
+    table.add("a block of labels", block.bytes() / 1e6, "MB")
+    table.add("fetch a block from another process", 1e3 * fetch, "ms")
+    table.add("take a block in, with its mirror images", 1e3 * add, "ms")
+    table.add("an optimisation step of 256 states", 1e3 * trained.seconds / steps, "ms")
+    table.add("weights of six networks reach a worker", 1e3 * (reach - nothing), "ms", "<= 50")
+    return Costs(each / 2, each / 2, compute, add + fetch, trained.seconds / steps, float(block.bytes()))
+
+
+def _reach(ray):
+    def read(references: list) -> int:
+        return sum(1 for reference in references if ray.get(reference) is not None)
+
+    return ray.remote(read)
+
+
+def _compare(real: dict[int, tuple[float, float]], local: tuple[float, float], costs: Costs, table: Table) -> None:
+    """Real steps beside simulated ones, and beside those of one process."""
+    blocks = -(-STATES // (labels._BLOCK // 8))
+    steps = max(CONFIG.least_steps, CONFIG.epochs * STATES // CONFIG.batch_size)
+    for count, (_, whole) in real.items():
+        found, name = simulate(costs, count, PARTS, blocks, steps), f"{count} worker{'s' if count > 1 else ''}"
+        table.add(f"a step, {name}", whole, "s")
+        table.add(f"the same, simulated over measured, {name}", found.seconds / whole, "ratio", "0.85 … 1.15")
+    table.add("labelling throughput, two workers over one", real[1][0] / real[2][0], "ratio", ">= 1.7")
+    table.add("time of a step, one worker over one process with one thread", real[1][1] / local[1], "ratio", "<= 1.10")
+
+
+def _extrapolate(costs: Costs, table: Table) -> None:
+    """Steps of the paper's size on clusters: 200 000 labelled states for each part, six epochs; half the parts in a step."""
+    blocks, steps = -(-200_000 // 2048), 6 * 2 * 200_000 // 256
+    wide = replace(costs, bandwidth=BANDWIDTH)
+    curves = {}
+    for parts in (6, 60, 1000):
+        one = simulate(wide, 1, parts // 2, blocks, steps)
+        curves[parts] = {}
+        for workers in (2**i for i in range(11)):
+            found = simulate(wide, workers, parts // 2, blocks, steps)
+            curves[parts][workers] = one.seconds / found.seconds
+            if workers in (16, 196, 1024) or workers == 128:
+                table.add(f"simulated speed-up, {parts} parts, {workers} workers", curves[parts][workers], "ratio")
+        last = simulate(wide, 1024, parts // 2, blocks, steps)
+        table.add(f"labels through the driver if they are kept, {parts} parts", last.driver_bytes / 1e9, "GB")
+        table.add(f"labels that an actor receives, {parts} parts", last.actor_bytes / 1e9, "GB")
+    _draw(curves)
+
+
+def _draw(curves: dict[int, dict[int, float]]) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5, 3.4), layout="constrained", dpi=120)
+    axes = figure.add_subplot()
+    for (parts, curve), color, marker in zip(curves.items(), ("#3572a5", "#c2571a", "#2f7d4f"), "os^", strict=True):
+        axes.loglog(list(curve), list(curve.values()), marker=marker, color=color, label=f"{parts} parts", base=2)
+    ideal = next(iter(curves.values()))
+    axes.loglog(list(ideal), list(ideal), "--", color="#9aa5b1", label="ideal", base=2)
+    axes.set(xlabel="workers", ylabel="speed-up of a step", title="simulated from costs measured on two cores")
+    ticks = list(ideal)[::2]
+    axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+    axes.set_yticks(ticks, [f"{tick:,}" for tick in ticks])
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(Path(__file__).parent / "scaling.png")

@@ -1,0 +1,67 @@
+"""Labelled states of a part, in memory and on disk."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.trainers import PolicyIterationConfig, papi_nt, parts
+from torchrl_pomdp.trainers.parts import PartData, PartImages
+
+CONFIG = PolicyIterationConfig(iterations=1, samples_per_part=90, validation_states=20, epochs=1, least_steps=8)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return make_problem("line3")
+
+
+def trained(problem):
+    (iteration,) = papi_nt(problem, CONFIG, GreedyRepair(problem.model))
+    return [p.tolist() for p in iteration.policy.parameters()]
+
+
+def test_what_lies_on_disk_trains_the_same(problem, monkeypatch, tmp_path):
+    expected, seen, storage = trained(problem), [], parts.LazyMemmapStorage
+
+    def noted(*args, **options):
+        seen.append(options["scratch_dir"])
+        return storage(*args, **options)
+
+    monkeypatch.setattr(parts, "LazyMemmapStorage", noted)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(parts, "MEMORY", 5000)
+    assert trained(problem) == expected
+    assert len(seen) == 6
+    assert all(folder.startswith(str(tmp_path)) for folder in seen)
+    assert list(tmp_path.iterdir()) == [], "nothing is left there"
+
+
+def test_blocks_are_kept_in_memory_up_to_the_limit(problem, monkeypatch, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    y = problem.training[0](torch.arange(64))
+    data = PartData(0, PartImages(problem.partition, problem.symmetries[:1]))
+    monkeypatch.setattr(parts, "MEMORY", int(2.5 * y.set("partition", torch.zeros(64, dtype=torch.int64)).bytes()))
+    for number in range(4):
+        data.add(0, y)
+        assert data.large == (number > 1)
+    rows = list(data)
+    assert [block.is_memmap() for block in rows] == [False, False, True, True]
+    assert all(torch.equal(block["belief"], y["belief"]) for block in rows)
+    assert len(data) == 256
+    data.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_order_does_not_depend_on_the_blocks(problem):
+    y = problem.training[1](torch.arange(100))
+    images, found = PartImages(problem.partition, problem.symmetries), []
+    for size in (100, 7):
+        data = PartData(1, images)
+        for block in y.split(size):
+            data.add(1, block)
+        found.append(torch.cat(list(data))["belief"])
+    assert torch.equal(*found)
+    assert images.counts(y) == [0, 200, 0, 0, 0, 0]
