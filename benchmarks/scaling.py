@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 import torch
 
@@ -21,43 +22,43 @@ from torchrl_pomdp.trainers.parts import PartImages, PartJob
 from torchrl_pomdp.workers import LOCAL, Workers
 
 # A step of the startgame of linear20: its parts, and the labelled states of each.
-PARTS, STATES = 3, 24_576
-CONFIG = PolicyIterationConfig(samples_per_part=STATES, epochs=1, least_steps=400)
+PARTS, STATES, BLOCK = 3, 3072, 256
+CONFIG = PolicyIterationConfig(samples_per_part=STATES, epochs=6, least_steps=2000)
 # Of a cluster: 10 Gbit/s into each machine.
 BANDWIDTH = 1.25e9
 
 
 def scaling(table: Table) -> None:
-    """Labels of a network's rollout (10 trajectories) and training of three parts on Ray, one thread a worker."""
+    """Labels of a network's rollout (2 trajectories) and training of three parts on Ray, one thread a worker."""
     from torchrl_pomdp.distributed import RayWorkers
 
     real = {}
-    with threads(1):
+    with threads(1), patch.object(labels, "_BLOCK", 8 * BLOCK):
         for count in (1, 2):
             with RayWorkers(num_workers=count) as workers:
                 # Processes start, and compiled loops are read.
-                _step(workers)
+                _step(workers, 2 * BLOCK)
                 real[count] = _step(workers)
                 costs = _measure(workers, table if count == 2 else Table())
         _compare(real, _step(LOCAL), costs, table)
     _extrapolate(costs, table)
 
 
-def _collectors() -> dict[int, RolloutImprovement]:
+def _collectors(states: int = STATES) -> dict[int, RolloutImprovement]:
     problem, policy = linear20(), networks()
     return {
         part: RolloutImprovement(
             BeliefEnv(problem.model, problem.start),
             policy,
             states=PartSampler({part: problem.training[part]}, seed=part),
-            label=partial(RolloutPolicy, trajectories=10),
-            frames_per_batch=STATES,
+            label=partial(RolloutPolicy, trajectories=2),
+            frames_per_batch=states,
         )
         for part in range(PARTS)
     }
 
 
-def _step(workers: Workers) -> tuple[float, float]:
+def _step(workers: Workers, states: int = STATES) -> tuple[float, float]:
     """Seconds until the labels of a step are there, and until it is done."""
     images = PartImages(linear20().partition, linear20().symmetries)
     begin = time.perf_counter()
@@ -65,7 +66,7 @@ def _step(workers: Workers) -> tuple[float, float]:
     for part in range(PARTS):
         job = PartJob(part, f"part {part}", part, networks().policies[part], ClassificationLoss, images, CONFIG)
         trainings[part] = workers.training(job, None, False)
-    blocks = {part: collector.blocks(workers, images.counts) for part, collector in _collectors().items()}
+    blocks = {part: collector.blocks(workers, images.counts) for part, collector in _collectors(states).items()}
     for part, own in blocks.items():
         for block in own:
             for other, training in trainings.items():
@@ -84,12 +85,11 @@ def _measure(workers: Workers, table: Table) -> Costs:
     """Costs of the parts of a step."""
     import ray
 
-    size = labels._BLOCK // workers.pieces
     problem, images = linear20(), PartImages(linear20().partition, linear20().symmetries)
     collector = _collectors()[0]
     shared = problem.model, collector.labeller, collector.states, images.counts
-    block, _ = labels.label_states(shared, torch.arange(size))
-    compute = seconds(lambda: labels.label_states(shared, torch.arange(size)))[0]
+    block, _ = labels.label_states(shared, torch.arange(BLOCK))
+    compute = seconds(lambda: labels.label_states(shared, torch.arange(BLOCK)))[0]
     list(workers.tasks(_nothing, None, range(20), str))
     begin, count = time.perf_counter(), 500
     results = workers.tasks(_nothing, None, range(count), str)
@@ -102,13 +102,13 @@ def _measure(workers: Workers, table: Table) -> Costs:
         data.add(0, block)
     add = (time.perf_counter() - begin) / 4
     trained = job.train(data, None, False)
-    steps = max(100, 4 * 2 * size // CONFIG.batch_size // 2)
+    steps = 100
     reference = ray.put(block)
     fetch = seconds(lambda: ray.get(reference))[0]
     weights = ray.put(networks())
     reach = seconds(lambda: ray.get(_reach(ray).remote([weights])), repeats=9)[0]
     nothing = seconds(lambda: ray.get(_reach(ray).remote([])), repeats=9)[0]
-    table.add("label a block of 2048 states, one core", compute, "s")
+    table.add(f"label a block of {BLOCK} states, one core", compute, "s")
     table.add("a task that does nothing, driver and two workers", 1e3 * each, "ms")
     table.add("a block of labels", block.bytes() / 1e6, "MB")
     table.add("fetch a block from another process", 1e3 * fetch, "ms")
@@ -127,8 +127,7 @@ def _reach(ray):
 
 def _compare(real: dict[int, tuple[float, float]], local: tuple[float, float], costs: Costs, table: Table) -> None:
     """Real steps beside simulated ones, and beside those of one process."""
-    blocks = -(-STATES // (labels._BLOCK // 8))
-    steps = max(CONFIG.least_steps, CONFIG.epochs * STATES // CONFIG.batch_size)
+    blocks, steps = -(-STATES // BLOCK), CONFIG.least_steps
     for count, (_, whole) in real.items():
         found, name = simulate(costs, count, PARTS, blocks, steps), f"{count} worker{'s' if count > 1 else ''}"
         table.add(f"a step, {name}", whole, "s")
@@ -139,8 +138,9 @@ def _compare(real: dict[int, tuple[float, float]], local: tuple[float, float], c
 
 def _extrapolate(costs: Costs, table: Table) -> None:
     """Steps of the paper's size on clusters: 200 000 labelled states for each part, six epochs; half the parts in a step."""
-    blocks, steps = -(-200_000 // 2048), 6 * 2 * 200_000 // 256
-    wide = replace(costs, bandwidth=BANDWIDTH)
+    blocks, steps, scale = -(-200_000 // 2048), 6 * 2 * 200_000 // 256, 2048 / BLOCK
+    # Blocks of the usual size.
+    wide = replace(costs, compute=scale * costs.compute, add=scale * costs.add, block=scale * costs.block, bandwidth=BANDWIDTH)
     curves = {}
     for parts in (6, 60, 1000):
         one = simulate(wide, 1, parts // 2, blocks, steps)
