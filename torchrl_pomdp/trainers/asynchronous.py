@@ -6,6 +6,7 @@ its next version, and goes on. No part waits for another one but for a bound: it
 
 from __future__ import annotations
 
+import copy
 import json
 import shutil
 import threading
@@ -14,6 +15,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from torchrl_pomdp.checks import check_instance, check_integer
 from torchrl_pomdp.evaluation import compare
@@ -76,7 +79,7 @@ class AsynchronousIteration:
 
     Attributes:
         best: the best policy so far.
-        published: what the parts have published, in the order in which they did.
+        published: what the parts have published, in the order in which they did; first, by part, what an interrupted run has.
 
     Raises:
         TypeError: if an argument is of the wrong kind.
@@ -121,6 +124,7 @@ class AsynchronousIteration:
             self._restore(run.folder)
         best_costs = run._validate(run.base_policy, "base policy")
         run._visit(run.base_policy, 0)
+        run._make_encoders()
         threads = [threading.Thread(target=self._improve, args=(part,), daemon=True) for part in range(len(self._networks))]
         for thread in threads:
             thread.start()
@@ -200,7 +204,8 @@ class AsynchronousIteration:
             network = run._initial(index, part, local, values, number)
             cache = None if path is None else path.with_name(f"version-{number}-{index + 1}.labels")
             collector = run._collector(index, PartitionedPolicy(local), PartitionedValue(values), number, cache, part)
-            training = run._training(index, part, network, number)
+            # A copy, encoder and all: a training takes modules apart that other parts read.
+            training = run._training(index, part, copy.deepcopy(network), number)
             for block in collector.blocks(run.workers, run._images.counts):
                 if self._stopped:
                     return None
@@ -234,7 +239,7 @@ class AsynchronousIteration:
             "policy": networks.policy.state_dict() if isinstance(networks.policy, LocalNetwork) else {},
             "value": networks.value.state_dict() if isinstance(networks.value, LocalNetwork) else {},
             "records": json.dumps({name: record.to_dict() for name, record in networks.records.items()}),
-            "used": list(version.used),
+            "used": torch.tensor(version.used),
         }
         keep(path, f"{self._owner} {version.part} {version.number}", content)
 
@@ -266,5 +271,5 @@ class AsynchronousIteration:
                 mine[part] = self.run._initial(index, part, local, values, number).eval()
                 mine[part].load_state_dict(content[key])
         records = {name: PartRecord(**record) for name, record in json.loads(content["records"]).items()}
-        self.published.append(Version(part, number, tuple(content["used"])))
+        self.published.append(Version(part, number, tuple(content["used"].tolist())))
         return _Networks(local[part], values[part], records)

@@ -176,6 +176,10 @@ class PolicyIteration:
         """What the value networks share: the policy networks' where these see the state as they do."""
         return make_encoder(self.problem, self.config) if self._multiagent else self._encoder
 
+    def _make_encoders(self) -> None:
+        """Make the encoders now, for those who ask for them at the same time."""
+        _ = self._encoder, self._value_encoder
+
     def _start(self) -> None:
         self.best: TensorDictModuleBase = self.base_policy
         self.memory = StateMemory(self.problem.model, self.config.memory_capacity, seed=self._seed(0, "visits"))

@@ -1,0 +1,131 @@
+"""Parts that improve at their own pace, here in threads of one process."""
+
+from __future__ import annotations
+
+import json
+import threading
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchrl_pomdp.modules.networks import LocalNetwork
+from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.trainers import AsynchronousIteration, PolicyIterationConfig, asynchronous, papi_nt, papi_t
+from torchrl_pomdp.trainers.run import TrainingRun
+
+CONFIG = PolicyIterationConfig(
+    iterations=2, samples_per_part=60, value_samples=40, validation_states=60, epochs=1, least_steps=10
+)
+
+
+@pytest.fixture(scope="module")
+def line3():
+    return make_problem("line3")
+
+
+def asynchronously(problem, recipe=papi_nt, staleness=1, base=GreedyRepair, config=CONFIG, **options):
+    return AsynchronousIteration(recipe(problem, config, base(problem.model), **options), staleness)
+
+
+def weights(policy):
+    return [p.tolist() for p in policy.parameters()]
+
+
+def within(run):
+    return all(version.number - 1 - min(version.used) <= run.staleness for version in run.published)
+
+
+@pytest.mark.parametrize("recipe", [papi_nt, papi_t])
+def test_every_part_publishes_every_version(line3, recipe):
+    run = asynchronously(line3, recipe)
+    iterations = list(run)
+    assert [iteration.number for iteration in iterations] == [1, 2]
+    assert sorted((version.part, version.number) for version in run.published) == [(p, n) for p in range(6) for n in (1, 2)]
+    assert within(run)
+    for iteration in iterations:
+        assert all(isinstance(network, LocalNetwork) for network in iteration.policy.policies)
+        trained = [isinstance(value, LocalNetwork) for value in iteration.value.values]
+        assert trained == [recipe is papi_t and part in (3, 4, 5) for part in range(6)]
+        steps = 2 if recipe is papi_t else 1
+        assert len(iteration.records) == 6 + 3 * (steps - 1)
+    with torch.no_grad():
+        y = line3.model.with_features(line3.start(torch.arange(5)))
+        assert iterations[-1].policy(y)["action"].shape == (5,)
+
+
+def test_without_staleness_all_versions_are_made_from_those_before(line3):
+    run = asynchronously(line3, staleness=0)
+    list(run)
+    assert all(min(version.used) >= version.number - 1 for version in run.published)
+
+
+def test_the_best_policy_is_one_that_was_accepted(line3):
+    """Hardly any training makes networks that are worse than a near-optimal base policy."""
+    run = asynchronously(line3, base=UrgencyRepair)
+    assert [iteration.accepted for iteration in run] == [False, False]
+    assert run.best is run.run.base_policy
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL: nothing catches it."""
+
+
+def test_an_interrupted_run_goes_on_from_the_last_versions(line3, tmp_path, monkeypatch):
+    run, keep, count = asynchronously(line3, folder=tmp_path / "run"), asynchronous.keep, []
+
+    def dies(*args):
+        count.append(args)
+        if len(count) > 8:
+            raise Killed
+        keep(*args)
+
+    monkeypatch.setattr(asynchronous, "keep", dies)
+    with pytest.raises(Killed):
+        list(run)
+    monkeypatch.undo()
+    before = {path: path.read_bytes() for path in (tmp_path / "run").glob("part-*/version-*.pt")}
+    assert len(before) == 8
+    again = asynchronously(line3, folder=tmp_path / "run")
+    found = list(again)
+    assert all(path.read_bytes() == content for path, content in before.items())
+    assert len(again.published) == 12
+    assert within(again)
+    once_more = asynchronously(line3, folder=tmp_path / "run")
+    for one, other in zip(once_more, found, strict=True):
+        assert weights(one.policy) == weights(other.policy)
+        assert (one.accepted, one.comparison) == (other.accepted, other.comparison)
+    assert len(json.loads((tmp_path / "run/versions.json").read_text())) == 2
+    with pytest.raises(ValueError, match="staleness"):
+        list(asynchronously(line3, staleness=2, folder=tmp_path / "run"))
+
+
+def test_what_stops_a_part_stops_all(line3, monkeypatch):
+    run = asynchronously(line3)
+    collector = run.run._collector
+
+    def broken(index, policy, value, number, cache, part):
+        if part == 4:
+            raise ArithmeticError("no idea")
+        return collector(index, policy, value, number, cache, part)
+
+    monkeypatch.setattr(run.run, "_collector", broken)
+    with pytest.raises(ArithmeticError, match="no idea"):
+        list(run)
+
+
+def test_who_looks_no_further_stops_the_parts(line3):
+    before = threading.active_count()
+    for _ in asynchronously(line3, config=replace(CONFIG, iterations=30)):
+        break
+    assert threading.active_count() == before
+
+
+def test_a_training_run(line3, tmp_path):
+    run = TrainingRun(line3, "pAPI-NT", config=CONFIG, states=20, online_states=0, staleness=1)
+    first = run.carry_out(tmp_path / "run")
+    assert list(first) == ["greedy", "urgency", "R-NT of greedy", "pAPI-NT 1", "pAPI-NT 2"]
+    assert run.carry_out(tmp_path / "run") == first
+    with pytest.raises(ValueError, match="staleness"):
+        replace(run, staleness=None).carry_out(tmp_path / "run")
