@@ -15,7 +15,7 @@ BENCHMARKS = {
     for function in (
         engine.trajectories, engine.looks, engine.batch, engine.network, engine.router, engine.locations, engine.memory,
         engine.env_step, tabular.updates, decisions.decision, decisions.labels, decisions.adaptive, decisions.expectation,
-        online.online, searches.searches, robots.robots, scaling.scaling,
+        online.online, searches.searches, robots.robots, scaling.scaling, scaling.disk,
         where.profile, rocksample.rocksample_updates, rocksample.rocksample_rewards,
     )
 }  # fmt: skip

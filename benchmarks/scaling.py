@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from threading import Event, Thread
 from unittest.mock import patch
 
 import torch
@@ -18,6 +21,7 @@ from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.modules import RolloutPolicy
 from torchrl_pomdp.objectives import ClassificationLoss
+from torchrl_pomdp.trainers import make_networks
 from torchrl_pomdp.trainers.parts import PartImages, PartJob
 from torchrl_pomdp.workers import LOCAL, Workers
 
@@ -154,6 +158,50 @@ def _extrapolate(costs: Costs, table: Table) -> None:
         table.add(f"labels through the driver if they are kept, {parts} parts", last.driver_bytes / 1e9, "GB")
         table.add(f"labels that an actor receives, {parts} parts", last.actor_bytes / 1e9, "GB")
     _draw(curves)
+
+
+def disk(table: Table) -> None:
+    """Training on labelled states of linear20 beyond memory: what is not mapped to disk, from 10^5 to 10^7 states."""
+    problem = linear20()
+    images = PartImages(problem.partition, problem.symmetries[:1])
+    policy = RolloutPolicy(problem.model, problem.base_policies["greedy"], trajectories=2)
+    block = policy(problem.model.derive(problem.training[1](torch.arange(16_000))))
+    config = PolicyIterationConfig(samples_per_part=1, epochs=1, least_steps=1, batch_size=10_000)
+    for count in (10**5, 10**6, 10**7):
+        network = make_networks(problem, config, seed=0).policies[1]
+        job = PartJob(1, "part 1", 0, network, ClassificationLoss, images, config)
+        before, data = _private(), job.open()
+        with _peak() as peak:
+            for _ in range(count // len(block)):
+                data.add(1, block)
+            data.add(1, block[: count % len(block)])
+            size = data._bytes
+            job.train(data, None, False)
+        table.add(f"memory for {count:,} labelled states of {size / count:.0f} bytes", (peak[0] - before) / 2**30, "GiB")
+
+
+def _private() -> int:
+    """Bytes of this process that are no mapped files."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
+
+
+@contextmanager
+def _peak() -> Iterator[list[int]]:
+    """The largest that it has been, looked at ten times a second."""
+    found, done = [_private()], Event()
+
+    def look() -> None:
+        while not done.wait(0.1):
+            found[0] = max(found[0], _private())
+
+    thread = Thread(target=look, daemon=True)
+    thread.start()
+    try:
+        yield found
+    finally:
+        done.set()
+        thread.join()
 
 
 def _draw(curves: dict[int, dict[int, float]]) -> None:

@@ -2,6 +2,8 @@ r"""Teaching the network of one part, under TorchRL's ``Trainer`` (paper, Sectio
 
 from __future__ import annotations
 
+import ctypes
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -29,6 +31,9 @@ __all__ = ["MEMORY", "PartData", "PartImages", "PartJob", "PartRecord", "Trained
 
 MEMORY = 2 << 30
 """Bytes of a part's labelled states beyond which they are mapped to disk, in a temporary folder."""
+
+# Bytes that are written to disk before memory is given back.
+_GIVEN_BACK = 1 << 28
 
 _LOG_INTERVAL = 50
 
@@ -124,7 +129,8 @@ class PartData:
         self.part, self.images = part, images
         # By the part whose states were labelled and by symmetry, so that the order does not depend on the blocks.
         self._rows: dict[tuple[int, int], list[Any]] = {}
-        self._bytes = 0
+        # Bytes so far, and those written since memory was last given back.
+        self._bytes = self._written = 0
         self._folder: TemporaryDirectory[str] | None = None
 
     def add(self, source: int, block: TensorDictBase) -> None:
@@ -132,8 +138,12 @@ class PartData:
         for number, rows in enumerate(self.images.of_part(self.part, block)):
             self._bytes += rows.bytes()
             if self.large and len(rows):
+                self._written += rows.bytes()
                 rows = rows.memmap(self.folder / f"{source}-{number}-{len(self._rows.get((source, number), []))}")
             self._rows.setdefault((source, number), []).append(rows)
+        if self._written > _GIVEN_BACK:
+            give_back()
+            self._written = 0
 
     def __iter__(self) -> Iterator[Any]:
         """The blocks, in the order of the parts and symmetries."""
@@ -159,6 +169,13 @@ class PartData:
         self._rows.clear()
         if self._folder is not None:
             self._folder.cleanup()
+
+
+def give_back() -> None:
+    """Give memory that is free back to the system, which glibc hardly does where blocks come and go."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
 
 
 @dataclass(frozen=True)
