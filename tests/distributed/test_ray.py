@@ -125,7 +125,8 @@ def test_a_killed_actor_changes_nothing(cluster, small):
 
     def kill():
         while not killed:
-            for process in processes("ray::PartActor.train")[:1]:
+            own = set(descendants(os.getpid())) & set(processes("ray::PartActor.train"))
+            for process in sorted(own)[:1]:
                 os.kill(process, signal.SIGKILL)
                 killed.append(process)
             time.sleep(0.01)
@@ -244,6 +245,19 @@ def test_a_worker_that_dies_again_and_again_is_given_up(cluster):
 
     with pytest.raises(WorkerError, match="number 7: WorkerCrashedError"):
         list(cluster.tasks(dies, None, [7], lambda item: f"number {item}"))
+
+
+def test_what_was_released_does_nothing_more(cluster):
+    """A call of Ray's would start a cluster again."""
+    workers = RayWorkers()
+    results = workers.tasks(lambda shared, item: (item, item), None, list(range(50)), str)
+    next(results)
+    workers.close()
+    workers.close()
+    for use in (lambda: next(results), lambda: workers.put(1), lambda: workers.tasks(None, None, [], str)):
+        with pytest.raises(WorkerError, match="the workers were released: make new ones"):
+            use()
+    assert list(cluster.tasks(lambda shared, item: (item, item), None, [1], str)), "the cluster is not theirs"
 
 
 def test_a_running_cluster_has_the_workers_that_it_has(cluster):

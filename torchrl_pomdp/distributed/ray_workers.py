@@ -20,7 +20,7 @@ __all__ = ["RayWorkers"]
 
 # Tasks that are given out for each worker: one that it does, and one that waits, so that no worker does.
 _AHEAD = 2
-# How often a task of a worker that dies is done again: with the same seeds, so that nothing changes.
+# How often a task or a training whose process dies is done again: with the same seeds, so that nothing changes.
 _RETRIES = 5
 _LOOPBACK = "127.0.0.1"
 
@@ -55,16 +55,22 @@ class RayWorkers(Workers):
         if address is not None:
             check_text("address", address)
         wanted = None if num_workers is None else check_integer("num_workers", num_workers, 1, 10**5)
-        self._own = not ray.is_initialized()
+        self._own, self._closed = not ray.is_initialized(), False
         if wanted is not None and not (self._own and address is None):
             raise ValueError(f"num_workers is for a cluster that is started here, got {wanted} for one that is running")
-        if self._own and address is None:
-            ray.init("local", num_cpus=wanted, include_dashboard=False, log_to_driver=False, _node_ip_address=_LOOPBACK)
-        elif self._own:
-            ray.init(address, log_to_driver=False)
-        self.num_workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
         self._actors: dict[int, Any] = {}
+        # Reports of tasks that were given out and not collected yet.
+        self._given: set[Any] = set()
         self._do: Any = ray.remote(num_returns=2, num_cpus=1, max_retries=_RETRIES)(_do)
+        try:
+            if self._own and address is None:
+                ray.init("local", num_cpus=wanted, include_dashboard=False, log_to_driver=False, _node_ip_address=_LOOPBACK)
+            elif self._own:
+                ray.init(address, log_to_driver=False)
+            self.num_workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
+        except BaseException:
+            self.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -73,13 +79,24 @@ class RayWorkers(Workers):
         self.close()
 
     def close(self) -> None:
-        """Stop the actors, and the cluster if it was started here."""
-        for actor in self._actors.values():
-            ray.kill(actor)
-        self._actors.clear()
-        if self._own:
-            ray.shutdown()
-            self._own = False
+        """Give up what is not done, stop the actors, and the cluster if it was started here."""
+        if self._closed:
+            return
+        # Every call of Ray's would start it again once it is stopped.
+        self._closed = True
+        try:
+            if ray.is_initialized():
+                for report in list(self._given):
+                    ray.cancel(report)
+                for actor in list(self._actors.values()):
+                    ray.kill(actor)
+        finally:
+            if self._own:
+                ray.shutdown()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise WorkerError("the workers were released: make new ones")
 
     def check_device(self, device: torch.device) -> None:
         """See :meth:`Workers.check_device`: they compute on CPUs."""
@@ -88,24 +105,24 @@ class RayWorkers(Workers):
 
     def tasks(self, function: Task, shared: Any, items: Sequence[Any], name: Callable[[Any], str]) -> Iterator[tuple[Any, Any]]:
         """See :meth:`Workers.tasks`."""
+        self._check_open()
         # The first ones are given out now: where several kinds of tasks are asked for, they are done side by side.
         everyone, left, waiting = [ray.put(shared)] if items else [], deque(items), deque[tuple[Any, Any, Any]]()
 
         def give_out() -> None:
             while left and len(waiting) < _AHEAD * self.num_workers:
                 item = left.popleft()
-                waiting.append((*self._do.remote(function, everyone, item), item))
+                handle, report = self._do.remote(function, everyone, item)
+                self._given.add(report)
+                waiting.append((handle, report, item))
 
         def results() -> Iterator[tuple[Any, Any]]:
-            try:
-                while waiting:
-                    handle, report, item = waiting.popleft()
-                    found = self._get(report, name(item))
-                    give_out()
-                    yield handle, found
-            finally:
-                for _, report, _ in waiting:
-                    ray.cancel(report)
+            while waiting:
+                handle, report, item = waiting.popleft()
+                found = self._get(report, name(item))
+                self._given.discard(report)
+                give_out()
+                yield handle, found
 
         give_out()
         return results()
@@ -116,14 +133,16 @@ class RayWorkers(Workers):
 
     def put(self, value: Any) -> Any:
         """See :meth:`Workers.put`."""
+        self._check_open()
         return ray.put(value)
 
     def training(self, job: PartTraining, logger: Logger | None, progress: bool) -> Training:
         """See :meth:`Workers.training`; progress is shown by the number of trained parts."""
+        self._check_open()
         if job.part not in self._actors:
-            # They take a CPU only while they train, when nothing is labelled.
+            # They reserve no CPU, which labelling would then lack: where all parts train together, nothing is labelled.
             options: dict[str, Any] = {"num_cpus": 0, "scheduling_strategy": "SPREAD"}
-            made: Any = ray.remote(max_restarts=-1, max_task_retries=-1, **options)(PartActor)
+            made: Any = ray.remote(max_restarts=_RETRIES, max_task_retries=_RETRIES, **options)(PartActor)
             self._actors[job.part] = made.remote()
         return RayTraining(self._actors[job.part], job, logger, self._get)
 
@@ -140,6 +159,7 @@ class RayWorkers(Workers):
 
     def _get(self, reference: Any, name: str) -> Any:
         """What a reference gives; says what has failed."""
+        self._check_open()
         try:
             return ray.get(reference)
         except RayTaskError as error:
@@ -181,8 +201,9 @@ class RayTraining(Training):
         return trained
 
 
-# What this worker process has read of the shared values, the latest alone: tables and compiled loops are made once.
+# What this worker process has read of the shared values, the latest ones: tables and compiled loops are made once for each.
 _shared: dict[str, Any] = {}
+_KEPT = 8
 
 
 def _do(function: Task, everyone: list[Any], item: Any) -> tuple[Any, Any]:
@@ -190,8 +211,8 @@ def _do(function: Task, everyone: list[Any], item: Any) -> tuple[Any, Any]:
     torch.set_num_threads(1)
     (reference,) = everyone
     key = reference.hex()
-    if key not in _shared:
-        value = ray.get(reference)
-        _shared.clear()
-        _shared[key] = value
-    return function(_shared[key], item)
+    value = _shared.pop(key) if key in _shared else ray.get(reference)
+    _shared[key] = value
+    if len(_shared) > _KEPT:
+        del _shared[next(iter(_shared))]
+    return function(value, item)

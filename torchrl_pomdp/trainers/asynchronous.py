@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import json
-import shutil
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -61,12 +60,42 @@ class _Networks:
     records: dict[str, PartRecord] = field(default_factory=dict)
 
 
+@dataclass
+class _Progress:
+    """What the threads of an iteration share, under one lock.
+
+    Attributes:
+        networks: all versions of every part.
+        published: see :class:`AsynchronousIteration`.
+        met: the versions that each iteration has, of all parts.
+        failure: what has stopped a part.
+        stopped: whether all are to stop.
+    """
+
+    networks: list[list[_Networks]]
+    published: list[Version] = field(default_factory=list)
+    met: list[list[int]] = field(default_factory=list)
+    failure: BaseException | None = None
+    stopped: bool = False
+
+    def versions(self) -> list[int]:
+        """The last version of each part."""
+        return [len(own) - 1 for own in self.networks]
+
+    def meet(self) -> bool:
+        """Note an iteration if all parts have come further; whether they have."""
+        further = min(self.versions()) > len(self.met)
+        if further:
+            self.met.append(self.versions())
+        return further
+
+
 class AsynchronousIteration:
     r"""Policy iteration whose parts do not wait for each other.
 
     The networks of every part have a version, 0 for the base policy. To make version :math:`v+1` a part labels with the
-    versions :math:`v_q` of the others that are there when it begins, each at least :math:`v` less ``staleness``. Whenever the
-    last part has published its version k, the freshest networks of all parts together are iteration k: they are compared with
+    versions :math:`v_q` of the others that are there when it begins, each at least :math:`v` less ``staleness``. When the last
+    part publishes its version k, the freshest networks of all parts together are iteration k: they are compared with
     the best policy so far, and kept if they are better with confidence, as in :class:`PolicyIteration`. Which networks meet
     depends on time: a seed does not give the same result again.
 
@@ -104,34 +133,33 @@ class AsynchronousIteration:
         self.plan, self.best = iteration.plan, iteration.best
         self.published: list[Version] = []
         self._changed = threading.Condition()
-        self._start()
 
-    def _start(self) -> None:
+    def _start(self) -> _Progress:
         run = self.run
         run._start()
-        self.best, self.published = run.best, []
-        # All versions of every part, and those of each iteration.
-        self._networks = [[_Networks(run.base_policy, run._scale)] for _ in range(run.partition.num_parts)]
-        self._met: list[list[int]] = []
-        self._failure: BaseException | None = None
-        self._stopped = False
+        base = _Networks(run.base_policy, run._scale)
+        state = _Progress([[base] for _ in range(run.partition.num_parts)])
+        self.best, self.published = run.best, state.published
+        return state
 
     def __iter__(self) -> Iterator[Iteration]:
-        """Carry out the iterations: yields one whenever all parts have a next version."""
-        run = self.run
-        self._start()
+        """Carry out the iterations: yields one for each time that all parts have come further."""
+        run, state = self.run, self._start()
         if run.folder is not None:
-            self._restore(run.folder)
+            self._restore(run.folder, state)
         best_costs = run._validate(run.base_policy, "base policy")
         run._visit(run.base_policy, 0)
         run._make_encoders()
-        threads = [threading.Thread(target=self._improve, args=(part,), daemon=True) for part in range(len(self._networks))]
+        threads = [
+            threading.Thread(target=self._improve, args=(part, state), daemon=True) for part in range(len(state.networks))
+        ]
         for thread in threads:
             thread.start()
+        before = [0] * len(threads)
         try:
             for number in range(1, run.config.iterations + 1):
-                met = self._meet(number)
-                networks = [own[version] for own, version in zip(self._networks, met, strict=True)]
+                met = self._meet(number, state)
+                networks = [own[version] for own, version in zip(state.networks, met, strict=True)]
                 policy = PartitionedPolicy([own.policy for own in networks]).eval()
                 value = PartitionedValue([own.value for own in networks]).eval()
                 costs = run._validate(policy, f"iteration {number}")
@@ -141,73 +169,71 @@ class AsynchronousIteration:
                     self.best, best_costs = policy, costs
                 if number < run.config.iterations:
                     run._visit(policy, number)
-                records = {name: record for own in networks for name, record in own.records.items()}
+                since = [own[first + 1 : last + 1] for own, first, last in zip(state.networks, before, met, strict=True)]
+                records = {name: record for own in since for made in own for name, record in made.records.items()}
+                before = met
                 yield Iteration(number, policy, value, accepted, reason, comparison, records)
         finally:
             with self._changed:
-                self._stopped = True
+                state.stopped = True
                 self._changed.notify_all()
             for thread in threads:
                 thread.join(_PATIENCE)
 
-    def _versions(self) -> list[int]:
-        """The last version of each part."""
-        return [len(own) - 1 for own in self._networks]
-
-    def _meet(self, number: int) -> list[int]:
+    def _meet(self, number: int, state: _Progress) -> list[int]:
         """The versions that are an iteration, once all parts have come that far."""
-        if number > len(self._met):
-            with self._changed:
-                self._changed.wait_for(lambda: self._failure is not None or min(self._versions()) >= number)
-                if self._failure is not None:
-                    raise self._failure
-                self._met.append(self._versions())
-            self._note()
-        return self._met[number - 1]
+        with self._changed:
+            self._changed.wait_for(lambda: state.failure is not None or len(state.met) >= number)
+            if len(state.met) < number and state.failure is not None:
+                raise state.failure
+            return state.met[number - 1]
 
-    def _may_begin(self, number: int) -> bool:
+    def _may_begin(self, number: int, state: _Progress) -> bool:
         """Whether a part may begin to make a version, or is to stop."""
-        return self._stopped or number - 1 - min(self._versions()) <= self.staleness
+        return state.stopped or number - 1 - min(state.versions()) <= self.staleness
 
     # ---- a part ------------------------------------------------------------------------------------------------------
 
-    def _improve(self, part: int) -> None:
+    def _improve(self, part: int, state: _Progress) -> None:
         """Make the versions of a part, in a thread of its own."""
         try:
-            for number in range(len(self._networks[part]), self.run.config.iterations + 1):
+            for number in range(len(state.networks[part]), self.run.config.iterations + 1):
                 with self._changed:
-                    self._changed.wait_for(partial(self._may_begin, number))
-                    used = self._versions()
-                    freshest = [own[-1] for own in self._networks]
-                networks = None if self._stopped else self._version(part, number, freshest)
-                if networks is None:
-                    return
-                version = Version(part, number, tuple(used))
-                self._keep(version, networks)
+                    self._changed.wait_for(partial(self._may_begin, number, state))
+                    used = state.versions()
+                    freshest = [own[-1] for own in state.networks]
+                networks = None if state.stopped else self._version(part, number, freshest, state)
                 with self._changed:
-                    self._networks[part].append(networks)
-                    self.published.append(version)
+                    # Who was told to stop meanwhile leaves the folder to others.
+                    if networks is None or state.stopped:
+                        return
+                    version = Version(part, number, tuple(used))
+                    self._keep(version, networks)
+                    state.networks[part].append(networks)
+                    state.published.append(version)
+                    if state.meet():
+                        self._note(state)
                     self._changed.notify_all()
         except BaseException as error:
             with self._changed:
-                self._failure = error
+                state.failure = error
                 self._changed.notify_all()
 
-    def _version(self, part: int, number: int, freshest: list[_Networks]) -> _Networks | None:
+    def _version(self, part: int, number: int, freshest: list[_Networks], state: _Progress) -> _Networks | None:
         """Networks that a part learns from the freshest of all parts; None if it has been stopped."""
         run, records = self.run, {}
         local, values = [own.policy for own in freshest], [own.value for own in freshest]
         for index, step in enumerate(run.plan):
             if part not in step.parts:
                 continue
-            name, path = f"{run._name(number, index)}-part-{part}", self._path(part, number)
+            name = f"{run._name(number, index)}-part-{part}"
             network = run._initial(index, part, local, values, number)
-            cache = None if path is None else path.with_name(f"version-{number}-{index + 1}.labels")
-            collector = run._collector(index, PartitionedPolicy(local), PartitionedValue(values), number, cache, part)
+            # What an interrupted run has labelled it has labelled with other networks: nothing is kept of it.
+            collector = run._collector(index, PartitionedPolicy(local), PartitionedValue(values), number, None, part)
             # A copy, encoder and all: a training takes modules apart that other parts read.
             training = run._training(index, part, copy.deepcopy(network), number)
             for block in collector.blocks(run.workers, run._images.counts):
-                if self._stopped:
+                if state.stopped:
                     return None
                 if block.summary[part]:
                     training.add(part, block.handle)
@@ -215,8 +241,6 @@ class AsynchronousIteration:
             network.load_state_dict(trained.weights)
             (local if isinstance(step, Improve) else values)[part] = network.eval()
             records[name] = PartRecord.of(collector, trained)
-            if cache is not None:
-                shutil.rmtree(cache, ignore_errors=True)
         return _Networks(local[part], values[part], records)
 
     # ---- the folder --------------------------------------------------------------------------------------------------
@@ -224,11 +248,11 @@ class AsynchronousIteration:
     def _path(self, part: int, number: int) -> Path | None:
         return None if self.run.folder is None else self.run.folder / f"part-{part}" / f"version-{number}.pt"
 
-    def _note(self) -> None:
+    def _note(self, state: _Progress) -> None:
         """Note which versions are an iteration."""
         if self.run.folder is not None:
             check_claimed(self.run.folder / _RECORD)
-            write_json(self.run.folder / _MET, self._met)
+            write_json(self.run.folder / _MET, state.met)
 
     def _keep(self, version: Version, networks: _Networks) -> None:
         path = self._path(version.part, version.number)
@@ -243,20 +267,24 @@ class AsynchronousIteration:
         }
         keep(path, f"{self._owner} {version.part} {version.number}", content)
 
-    def _restore(self, folder: Path) -> None:
+    def _restore(self, folder: Path, state: _Progress) -> None:
         """Take the folder, and what an interrupted run has kept there."""
         record = {**self.run._identity(), "staleness": self.staleness}
         claim(folder / _RECORD, record)
         self._owner = digest(record)
-        for part, own in enumerate(self._networks):
-            while (networks := self._kept(part, len(own), own[-1])) is not None:
+        for part, own in enumerate(state.networks):
+            while (found := self._kept(part, len(own), own[-1])) is not None:
+                version, networks = found
                 own.append(networks)
-        met = folder / _MET
-        for versions in json.loads(read_text(met)) if met.is_file() else []:
-            if all(version < len(own) for version, own in zip(versions, self._networks, strict=True)):
-                self._met.append(versions)
+                state.published.append(version)
+        last = state.versions()
+        for versions in _noted(folder / _MET):
+            # What is lost is made again.
+            if len(versions) == len(last) and all(0 < own <= there for own, there in zip(versions, last, strict=True)):
+                state.met.append(versions)
+        state.meet()
 
-    def _kept(self, part: int, number: int, before: _Networks) -> _Networks | None:
+    def _kept(self, part: int, number: int, before: _Networks) -> tuple[Version, _Networks] | None:
         """A version of a part that was kept, given the one before."""
         path = self._path(part, number)
         content = None if path is None else kept(path, f"{self._owner} {part} {number}", self.run.problem.model.device)
@@ -271,5 +299,14 @@ class AsynchronousIteration:
                 mine[part] = self.run._initial(index, part, local, values, number).eval()
                 mine[part].load_state_dict(content[key])
         records = {name: PartRecord(**record) for name, record in json.loads(content["records"]).items()}
-        self.published.append(Version(part, number, tuple(content["used"].tolist())))
-        return _Networks(local[part], values[part], records)
+        return Version(part, number, tuple(content["used"].tolist())), _Networks(local[part], values[part], records)
+
+
+def _noted(path: Path) -> list[list[int]]:
+    """The versions of each iteration as a file has them; none where it is damaged."""
+    try:
+        found = json.loads(read_text(path)) if path.is_file() else []
+    except (ValueError, OSError):
+        return []
+    sound = isinstance(found, list) and all(isinstance(own, list) and all(type(v) is int for v in own) for own in found)
+    return found if sound else []

@@ -33,6 +33,6 @@ def clear_log(logger: Logger | None, name: str) -> None:
     folder = Path(logger.experiment.log_dir) / "scalars" / name
     # The logger keeps the files open that it has written to.
     files = logger.experiment.files
-    for path in [path for path in files if Path(path).is_relative_to(folder)]:
+    for path in [path for path in list(files) if Path(path).is_relative_to(folder)]:
         files.pop(path).close()
     shutil.rmtree(folder, ignore_errors=True)

@@ -139,7 +139,7 @@ class PartData:
             self._bytes += rows.bytes()
             if self.large and len(rows):
                 self._written += rows.bytes()
-                rows = rows.memmap(self.folder / f"{source}-{number}-{len(self._rows.get((source, number), []))}")
+                rows = rows.cpu().memmap(self.folder / f"{source}-{number}-{len(self._rows.get((source, number), []))}")
             self._rows.setdefault((source, number), []).append(rows)
         if self._written > _GIVEN_BACK:
             give_back()
@@ -261,7 +261,8 @@ def train_part(
         optimization_stepper=stepper,
         progress_bar=False,
     )
-    trainer.register_op("process_optim_batch", lambda batch: buffer.sample())
+    device = next(loss.parameters()).device
+    trainer.register_op("process_optim_batch", lambda batch: buffer.sample().to(device))
     begin = time.perf_counter()
     # Products of a few rows are slower with several threads than with one, and sums of gradients would depend on their number.
     with kept_threads(1):
@@ -272,10 +273,11 @@ def train_part(
 def _filled(batch: TensorDictBase | PartData, size: int, seed: int) -> TensorDictReplayBuffer:
     """A replay buffer of the states that gives batches of a size; on disk where the states are."""
     blocks: list[Any] = [batch] if isinstance(batch, TensorDictBase) else list(batch)
-    device = blocks[0].device or torch.device("cpu")
     if isinstance(batch, PartData) and batch.large:
+        device = torch.device("cpu")
         storage = LazyMemmapStorage(len(batch), scratch_dir=str(batch.folder / "buffer"), device=device)
     else:
+        device = blocks[0].device or torch.device("cpu")
         storage = LazyTensorStorage(len(batch), device=device)
     buffer = TensorDictReplayBuffer(
         storage=storage,
@@ -285,7 +287,7 @@ def _filled(batch: TensorDictBase | PartData, size: int, seed: int) -> TensorDic
     )
     for block in blocks:
         if len(block):
-            buffer.extend(block.exclude("collector"))
+            buffer.extend(block.exclude("collector").to(device))
     return buffer
 
 
