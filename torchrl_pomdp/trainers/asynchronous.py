@@ -1,7 +1,8 @@
 r"""Asynchronous policy iteration: every part at its own pace (paper, Section V; Bertsekas and Yu, 2010).
 
-A part labels states with the rollout of the freshest published networks of all parts, trains its own on them, publishes them as
-its next version, and goes on. No part waits for another one but for a bound: it may be at most so many versions ahead.
+A part labels states with the rollout of the freshest published networks of all parts, and trains its own on them and on mirror
+images of what other parts have learnt from. It publishes them as its next version, and goes on. No part waits for another one
+but for a bound: it may be at most so many versions ahead.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import copy
 import json
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import torch
 
 from torchrl_pomdp.checks import check_instance, check_integer
+from torchrl_pomdp.collectors.labels import Block
 from torchrl_pomdp.evaluation import compare
 from torchrl_pomdp.files import check_claimed, claim, read_text, write_json
 from torchrl_pomdp.identity import digest
@@ -58,6 +60,8 @@ class _Networks:
     policy: Any
     value: Any
     records: dict[str, PartRecord] = field(default_factory=dict)
+    # What it has learnt from, by the step of the plan: mirror images of it lie in other parts.
+    blocks: list[tuple[int, Block]] = field(default_factory=list)
 
 
 @dataclass
@@ -201,7 +205,8 @@ class AsynchronousIteration:
                 with self._changed:
                     self._changed.wait_for(partial(self._may_begin, number, state))
                     used = state.versions()
-                    freshest = [own[-1] for own in state.networks]
+                    # With blocks of their own, which a next version would take away.
+                    freshest = [replace(own[-1], blocks=list(own[-1].blocks)) for own in state.networks]
                 networks = None if state.stopped else self._version(part, number, freshest, state)
                 with self._changed:
                     # Who was told to stop meanwhile leaves the folder to others.
@@ -209,6 +214,7 @@ class AsynchronousIteration:
                         return
                     version = Version(part, number, tuple(used))
                     self._keep(version, networks)
+                    state.networks[part][-1].blocks.clear()
                     state.networks[part].append(networks)
                     state.published.append(version)
                     if state.meet():
@@ -221,7 +227,7 @@ class AsynchronousIteration:
 
     def _version(self, part: int, number: int, freshest: list[_Networks], state: _Progress) -> _Networks | None:
         """Networks that a part learns from the freshest of all parts; None if it has been stopped."""
-        run, records = self.run, {}
+        run, records, learnt = self.run, {}, []
         local, values = [own.policy for own in freshest], [own.value for own in freshest]
         for index, step in enumerate(run.plan):
             if part not in step.parts:
@@ -235,13 +241,18 @@ class AsynchronousIteration:
             for block in collector.blocks(run.workers, run._images.counts):
                 if state.stopped:
                     return None
+                learnt.append((index, block))
                 if block.summary[part]:
                     training.add(part, block.handle)
+            for other, own in enumerate(freshest):
+                for at, block in own.blocks if other != part else []:
+                    if at == index and block.summary[part]:
+                        training.add(other, block.handle)
             trained = run.workers.trained({part: training})[part]
             network.load_state_dict(trained.weights)
             (local if isinstance(step, Improve) else values)[part] = network.eval()
             records[name] = PartRecord.of(collector, trained)
-        return _Networks(local[part], values[part], records)
+        return _Networks(local[part], values[part], records, learnt)
 
     # ---- the folder --------------------------------------------------------------------------------------------------
 
