@@ -22,7 +22,10 @@ ABOVE = {
     "collectors": {"objectives", "planners", "trainers"},
     "objectives": {"collectors", "planners", "trainers"},
     "planners": {"problems", "collectors", "objectives", "trainers"},
-    "trainers": set(),
+    "trainers": {"distributed"},
+    # Given to those above by the command and by users.
+    "distributed": {"envs", "modules", "problems", "collectors", "objectives", "planners", "trainers"},
+    "workers.py": {"envs", "modules", "problems", "collectors", "objectives", "planners", "trainers", "distributed"},
 }
 
 
@@ -60,3 +63,12 @@ def test_arrows_point_down(path):
     layer = room(path).split("/")[0]
     above = {f"torchrl_pomdp.{name}" for name in ABOVE.get(layer, ())}
     assert [found for found in sorted(imported(path)) if ".".join(found.split(".")[:2]) in above] == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=room)
+def test_ray_is_for_the_cluster_alone(path):
+    names = {
+        alias.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import) for alias in node.names
+    }
+    names |= {node.module for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom) and node.module}
+    assert room(path).startswith("distributed/") or not any(name.split(".")[0] == "ray" for name in names)
