@@ -120,39 +120,41 @@ def discounted_costs(
     seed = check_integer("seed", seed)
     first = check_integer("first", first, 0, MAX_STATES)
     check_instance("workers", workers, Workers).check_device(model.device)
-    shared = model, policy, start, seed, max_steps, terminal_cost
     name, progress = check_text("name", name), check_flag("progress", progress)
-    if workers is LOCAL:
-        with progress_bar(None, "step", name, progress) as bar:
-            return costs_of_states((*shared, bar), range(first, first + num_states))[0]
+    numbers, options = range(first, first + num_states), (start, seed, max_steps, terminal_cost)
+    if workers is not LOCAL:
+        return _costs_elsewhere(workers, (model, policy, *options), numbers, name, progress)
+    with progress_bar(None, "step", name, progress) as bar:
+        costs, unseen = costs_of_states((model, _Watched(policy, bar), *options), numbers)
+        bar.update(unseen)
+    return costs
+
+
+def _costs_elsewhere(workers: Workers, shared: tuple[Any, ...], numbers: range, name: str, progress: bool) -> Tensor:
+    """Costs from the start states with the given numbers, block by block; the bar counts start states."""
     size = max(1, _BLOCK // workers.pieces)
-    blocks = [range(i, min(i + size, first + num_states)) for i in range(first, first + num_states, size)]
+    blocks = [numbers[i : i + size] for i in range(0, len(numbers), size)]
+    tasks = workers.tasks(costs_of_states, shared, blocks, lambda own: f"{name}, start states {own[0]} … {own[-1]}")
     costs: list[Tensor] = []
-    with progress_bar(num_states, "state", name, progress) as bar:
-        tasks = workers.tasks(
-            costs_of_states, (*shared, None), blocks, lambda own: f"{name}, start states {own[0]} … {own[-1]}"
-        )
-        for handle, count in tasks:
+    with progress_bar(len(numbers), "state", name, progress) as bar:
+        for own, (handle, _) in zip(blocks, tasks, strict=True):
             costs.append(workers.fetch(handle))
-            bar.update(count)
+            bar.update(len(own))
     return torch.cat(costs)
 
 
 def costs_of_states(shared: tuple[Any, ...], numbers: range) -> tuple[Tensor, int]:
-    """Costs of the trajectories from the start states with the given numbers, and how many they are.
+    """Costs of the trajectories from the start states with the given numbers, and the steps of compiled simulations.
 
     Args:
-        shared: model, policy, start states, seed, number of stages, terminal cost, and a progress bar or None.
+        shared: model, policy, start states, seed, number of stages, and terminal cost.
         numbers: numbers of the start states.
     """
-    model, policy, start, seed, max_steps, terminal_cost, bar = shared
+    model, policy, start, seed, max_steps, terminal_cost = shared
     keys = seed_keys(seed, torch.arange(numbers.start, numbers.stop, device=model.device))
-    watched = policy if bar is None else _Watched(policy, bar)
-    cost = TruncatedRollout(model, watched, max_steps=max_steps, terminal_cost=terminal_cost)
+    cost = TruncatedRollout(model, policy, max_steps=max_steps, terminal_cost=terminal_cost)
     costs = cost(model.drawn(start, fold(keys, 0), "start"), fold(keys, 1))
-    if cost.scalar is not None and bar is not None:
-        bar.update(cost.simulated_steps)
-    return costs, len(numbers)
+    return costs, 0 if cost.scalar is None else cost.simulated_steps
 
 
 class _Watched:

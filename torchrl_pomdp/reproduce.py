@@ -84,9 +84,8 @@ _SAMPLES = {"linear20": 200_000, "line3": 200_000, "linear20_slow_repair": 200_0
 # repaired locations stay intact, as many as it takes to get to the damage.
 _MANY_ROBOTS = {"network32x4": 25, "network32x8": 5, "network32x10": 5}
 _MORE_SAMPLES = 500_000
-# Where a repair takes a random time, fewer trajectories of a label than these, or online than twice as many, make rollout worse
-# than its base policy.
-_SLOW_REPAIR = 20
+# Trajectories of a label and online where a repair takes a random time: with fewer, rollout is worse than its base policy.
+_LABEL_TRAJECTORIES, _ONLINE_TRAJECTORIES = {"linear20_slow_repair": 20}, {"linear20_slow_repair": 40}
 
 
 @dataclass(frozen=True)
@@ -171,7 +170,7 @@ def settings_config(settings: Literal["paper", "tuned"], problem: str, scale: fl
             validation_states=1000,
         )
     if settings == "tuned":
-        return replace(common, trajectories=_SLOW_REPAIR) if problem == "linear20_slow_repair" else common
+        return replace(common, trajectories=_LABEL_TRAJECTORIES.get(problem, common.trajectories))
     return replace(
         common,
         iterations=common.iterations if problem in _MANY_ROBOTS else 2,
@@ -210,9 +209,6 @@ def plan(
         raise ValueError(f"problems must be among {experiment.problems} for {experiment.name}, got {unknown[0]!r}")
     runs = {}
     for problem in problems or experiment.problems:
-        online = 5 if settings == "tuned" else 10
-        if problem == "linear20_slow_repair":
-            online = 2 * _SLOW_REPAIR
         for algorithm in experiment.algorithms:
             config = settings_config(settings, problem, scale, seed)
             if algorithm == "API":
@@ -225,7 +221,7 @@ def plan(
                 config,
                 states=experiment.states,
                 online_states=experiment.states,
-                online_trajectories=online,
+                online_trajectories=_ONLINE_TRAJECTORIES.get(problem, 5 if settings == "tuned" else 10),
             )
     return runs
 

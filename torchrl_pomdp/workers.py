@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any, Protocol
 
 import torch
@@ -62,9 +63,11 @@ class Workers(ABC):
 
     Attributes:
         pieces: into how many times smaller blocks work is cut than for a single process.
+        num_workers: trainings at once.
     """
 
     pieces: int
+    num_workers: int
 
     @abstractmethod
     def check_device(self, device: torch.device) -> None:
@@ -104,9 +107,14 @@ class Workers(ABC):
 
     def trained(self, trainings: Mapping[int, Training]) -> dict[int, Any]:
         """Carry out trainings; what they return, by the same keys."""
-        for training in trainings.values():
+        waiting, found = iter(trainings.values()), {}
+        for training in islice(waiting, self.num_workers):
             training.start()
-        return {key: training.result() for key, training in trainings.items()}
+        for key, training in trainings.items():
+            found[key] = training.result()
+            for following in islice(waiting, 1):
+                following.start()
+        return found
 
 
 class LocalWorkers(Workers):
@@ -118,7 +126,7 @@ class LocalWorkers(Workers):
         [2, 3]
     """
 
-    pieces = 1
+    pieces = num_workers = 1
 
     def check_device(self, device: torch.device) -> None:
         """See :meth:`Workers.check_device`: any."""

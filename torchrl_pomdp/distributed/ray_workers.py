@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -145,17 +145,6 @@ class RayWorkers(Workers):
             made: Any = ray.remote(max_restarts=_RETRIES, max_task_retries=_RETRIES, **options)(PartActor)
             self._actors[job.part] = made.remote()
         return RayTraining(self._actors[job.part], job, logger, self._get)
-
-    def trained(self, trainings: Mapping[int, Training]) -> dict[int, Any]:
-        """See :meth:`Workers.trained`; as many at once as there are workers."""
-        waiting, found = list(trainings), {}
-        for key in waiting[: self.num_workers]:
-            trainings[key].start()
-        for number, key in enumerate(waiting):
-            found[key] = trainings[key].result()
-            for following in waiting[number + self.num_workers : number + self.num_workers + 1]:
-                trainings[following].start()
-        return found
 
     def _get(self, reference: Any, name: str) -> Any:
         """What a reference gives; says what has failed."""

@@ -11,7 +11,7 @@ import copy
 import json
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -60,8 +60,6 @@ class _Networks:
     policy: Any
     value: Any
     records: dict[str, PartRecord] = field(default_factory=dict)
-    # What it has learnt from, by the step of the plan: mirror images of it lie in other parts.
-    blocks: list[tuple[int, Block]] = field(default_factory=list)
 
 
 @dataclass
@@ -70,6 +68,8 @@ class _Progress:
 
     Attributes:
         networks: all versions of every part.
+        learnt: what the last version of every part has learnt from, by the step of the plan: mirror images of it lie in other
+            parts.
         published: see :class:`AsynchronousIteration`.
         met: the versions that each iteration has, of all parts.
         failure: what has stopped a part.
@@ -77,6 +77,7 @@ class _Progress:
     """
 
     networks: list[list[_Networks]]
+    learnt: list[list[tuple[int, Block]]]
     published: list[Version] = field(default_factory=list)
     met: list[list[int]] = field(default_factory=list)
     failure: BaseException | None = None
@@ -134,7 +135,7 @@ class AsynchronousIteration:
     def __init__(self, iteration: PolicyIteration, staleness: int = 1) -> None:
         self.run = check_instance("iteration", iteration, PolicyIteration)
         self.staleness = check_integer("staleness", staleness, 0, 10**6)
-        self.plan, self.best = iteration.plan, iteration.best
+        self.best = iteration.best
         self.published: list[Version] = []
         self._changed = threading.Condition()
 
@@ -142,7 +143,8 @@ class AsynchronousIteration:
         run = self.run
         run._start()
         base = _Networks(run.base_policy, run._scale)
-        state = _Progress([[base] for _ in range(run.partition.num_parts)])
+        parts = range(run.partition.num_parts)
+        state = _Progress([[base] for _ in parts], [[] for _ in parts])
         self.best, self.published = run.best, state.published
         return state
 
@@ -205,16 +207,15 @@ class AsynchronousIteration:
                 with self._changed:
                     self._changed.wait_for(partial(self._may_begin, number, state))
                     used = state.versions()
-                    # With blocks of their own, which a next version would take away.
-                    freshest = [replace(own[-1], blocks=list(own[-1].blocks)) for own in state.networks]
-                networks = None if state.stopped else self._version(part, number, freshest, state)
+                    freshest, others = [own[-1] for own in state.networks], list(state.learnt)
+                made = None if state.stopped else self._version(part, number, freshest, others, state)
                 with self._changed:
                     # Who was told to stop meanwhile leaves the folder to others.
-                    if networks is None or state.stopped:
+                    if made is None or state.stopped:
                         return
+                    networks, state.learnt[part] = made
                     version = Version(part, number, tuple(used))
                     self._keep(version, networks)
-                    state.networks[part][-1].blocks.clear()
                     state.networks[part].append(networks)
                     state.published.append(version)
                     if state.meet():
@@ -225,8 +226,10 @@ class AsynchronousIteration:
                 state.failure = error
                 self._changed.notify_all()
 
-    def _version(self, part: int, number: int, freshest: list[_Networks], state: _Progress) -> _Networks | None:
-        """Networks that a part learns from the freshest of all parts; None if it has been stopped."""
+    def _version(
+        self, part: int, number: int, freshest: list[_Networks], others: list[list[tuple[int, Block]]], state: _Progress
+    ) -> tuple[_Networks, list[tuple[int, Block]]] | None:
+        """Networks that a part learns from the freshest of all parts, and from what; None if it has been stopped."""
         run, records, learnt = self.run, {}, []
         local, values = [own.policy for own in freshest], [own.value for own in freshest]
         for index, step in enumerate(run.plan):
@@ -244,15 +247,15 @@ class AsynchronousIteration:
                 learnt.append((index, block))
                 if block.summary[part]:
                     training.add(part, block.handle)
-            for other, own in enumerate(freshest):
-                for at, block in own.blocks if other != part else []:
+            for other, blocks in enumerate(others):
+                for at, block in blocks if other != part else []:
                     if at == index and block.summary[part]:
                         training.add(other, block.handle)
             trained = run.workers.trained({part: training})[part]
             network.load_state_dict(trained.weights)
             (local if isinstance(step, Improve) else values)[part] = network.eval()
             records[name] = PartRecord.of(collector, trained)
-        return _Networks(local[part], values[part], records, learnt)
+        return _Networks(local[part], values[part], records), learnt
 
     # ---- the folder --------------------------------------------------------------------------------------------------
 

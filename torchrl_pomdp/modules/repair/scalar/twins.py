@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_pomdp.modules.repair.scalar.view import (
-    Tables,
     View,
     expected_cost,
     intact,
@@ -183,39 +182,10 @@ def networks(data, view, controls):
 def elsewhere(data, view, controls):
     """A policy that knows another graph; for a control that is illegal here, the first that is legal.
 
-    ``data`` holds what the old graph has: destinations, order, distances, first controls, first moves, whether intact
-    locations may be repaired; and the policy.
+    ``data`` holds the tables that the policy sees, with the old graph, and the policy.
     """
-    destinations, order, distances, first_controls, first_moves, unrestricted, policy = data
-    now = view.tables
-    old = Tables(
-        now.kind,
-        now.powers,
-        now.cumulative,
-        now.stage_costs,
-        now.interval_costs,
-        now.discounts,
-        destinations,
-        order,
-        distances,
-        first_controls,
-        first_moves,
-        unrestricted,
-        now.columns,
-        now.prices,
-        now.damage,
-        now.works,
-        now.absorbing,
-        now.steady,
-        now.free,
-        now.upward,
-        now.least_cost,
-        now.terminal_probability,
-        now.damage_threshold,
-        now.low,
-        now.high,
-    )
-    seen = View(view.stage, view.location, view.level, view.since, view.intact, view.start, old, view.work, view.key)
+    tables, policy = data
+    seen = View(view.stage, view.location, view.level, view.since, view.intact, view.start, tables, view.work, view.key)
     choose(policy, seen, controls)
     for robot in range(len(controls)):
         # What is no control at all stays one that is refused.
