@@ -26,7 +26,7 @@ from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue
 from torchrl_pomdp.modules.networks import LocalNetwork
-from torchrl_pomdp.trainers.parts import PartRecord
+from torchrl_pomdp.trainers.parts import PartRecord, records_text, text_records
 from torchrl_pomdp.trainers.plan import Improve
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration, judge
 
@@ -276,7 +276,7 @@ class AsynchronousIteration:
         content = {
             "policy": networks.policy.state_dict() if isinstance(networks.policy, LocalNetwork) else {},
             "value": networks.value.state_dict() if isinstance(networks.value, LocalNetwork) else {},
-            "records": json.dumps({name: record.to_dict() for name, record in networks.records.items()}),
+            "records": records_text(networks.records),
             "used": torch.tensor(version.used),
         }
         keep(path, f"{self._owner} {version.part} {version.number}", content)
@@ -312,8 +312,9 @@ class AsynchronousIteration:
                 mine, key = (local, "policy") if isinstance(step, Improve) else (values, "value")
                 mine[part] = self.run._initial(index, part, local, values, number).eval()
                 mine[part].load_state_dict(content[key])
-        records = {name: PartRecord(**record) for name, record in json.loads(content["records"]).items()}
-        return Version(part, number, tuple(content["used"].tolist())), _Networks(local[part], values[part], records)
+        return Version(part, number, tuple(content["used"].tolist())), _Networks(
+            local[part], values[part], text_records(content["records"])
+        )
 
 
 def _noted(path: Path) -> list[list[int]]:

@@ -3,9 +3,10 @@ r"""Teaching the network of one part, under TorchRL's ``Trainer`` (paper, Sectio
 from __future__ import annotations
 
 import ctypes
+import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -65,6 +66,16 @@ class PartRecord:
         """The record of a part whose states a collector has labelled, in one batch."""
         made = collector.requested_frames_per_batch, collector.simulated_steps, collector.seconds
         return cls(*made, trained.seconds, trained.losses)
+
+
+def records_text(records: Mapping[str, PartRecord]) -> str:
+    """Records by name, as the text that a file keeps."""
+    return json.dumps({name: record.to_dict() for name, record in records.items()})
+
+
+def text_records(text: str) -> dict[str, PartRecord]:
+    """The records of such a text."""
+    return {name: PartRecord(**record) for name, record in json.loads(text).items()}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ order, the startgame is rolled out with the endgame networks of the same iterati
 from __future__ import annotations
 
 import copy
-import json
 import math
 import shutil
 from collections.abc import Iterator, Sequence
@@ -56,7 +55,7 @@ from torchrl_pomdp.trainers.architecture import (
     make_values,
 )
 from torchrl_pomdp.trainers.logs import clear_log
-from torchrl_pomdp.trainers.parts import PartImages, PartJob, PartRecord
+from torchrl_pomdp.trainers.parts import PartImages, PartJob, PartRecord, records_text, text_records
 from torchrl_pomdp.trainers.plan import Evaluate, Improve, Step, checked_plan
 from torchrl_pomdp.workers import LOCAL, Training, Workers
 
@@ -259,7 +258,7 @@ class PolicyIteration:
             return None
         for part, network in networks.items():
             network.load_state_dict(content["networks"][str(part)])
-        records = {key: PartRecord(**record) for key, record in json.loads(content["records"]).items()}
+        records = text_records(content["records"])
         if self.on_labels is not None:
             self.on_labels(sum(record.samples for record in records.values()), True)
         return records
@@ -288,7 +287,7 @@ class PolicyIteration:
             records[f"{name}-part-{part}"] = PartRecord.of(collectors[part], trained)
         if path is not None and cache is not None:
             states = {str(part): network.state_dict() for part, network in networks.items()}
-            content = {"networks": states, "records": json.dumps({key: r.to_dict() for key, r in records.items()})}
+            content = {"networks": states, "records": records_text(records)}
             check_claimed(path.parents[1] / _RECORD)
             keep(path, f"{self._owner} {name}", content)
             shutil.rmtree(cache, ignore_errors=True)
