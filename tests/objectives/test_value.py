@@ -7,6 +7,8 @@ import math
 import pytest
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.modules.tensordict_module.rnn import recurrent_mode
 
 from torchrl_pomdp.envs.repair import RandomState, RepairModel, damage_chain, line
 from torchrl_pomdp.modules import FlatEncoder, PolicyCost, PolicyNetwork, RolloutPolicy, ValueNetwork, ZeroCost
@@ -196,3 +198,16 @@ def test_training_among_states_of_scale_zero_leaves_finite_weights():
     _, losses = train_part(y, loss, PolicyIterationConfig(epochs=20, batch_size=30, least_steps=1), seed=0, name="part")
     assert all(bool(torch.isfinite(p).all()) for p in loss.parameters())
     assert losses["loss_value"] < before
+
+
+def test_losses_leave_the_modes_of_the_process_alone(line3, labelled):
+    """TorchRL's exploration type and recurrent mode are of the process: of two losses in threads one would leave them set."""
+    policy = PolicyNetwork(FlatEncoder(line3.model), line3.model.num_controls, (8,), generator=generator())
+    for loss in ClassificationLoss(policy), ValueLoss(value_network(line3.model), NeverRepairCost(line3.model)):
+        seen = []
+        loss.network.register_forward_hook(lambda *_, seen=seen: seen.append((exploration_type(), recurrent_mode())))
+        loss(labelled[:5])
+        assert seen == [(exploration_type(), recurrent_mode())]
+        with set_exploration_type(ExplorationType.RANDOM):
+            loss(labelled[:5])
+        assert seen[1] == (ExplorationType.RANDOM, recurrent_mode())

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_choice, check_instance
 from torchrl_pomdp.modules.agents import AgentNetwork
-from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of
+from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, without_modes
 
 __all__ = ["ClassificationLoss"]
 
@@ -22,6 +22,7 @@ LossName = Literal["soft", "cross_entropy", "cost_weighted", "l2", "advantage"]
 _TEMPERATURE = 0.1
 
 
+@without_modes
 class ClassificationLoss(LabelLoss):
     r"""Loss of a masked policy network against labels :math:`(y^s,u^s)` with Q-factors.
 

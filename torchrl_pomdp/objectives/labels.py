@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import fields
+from typing import Any, TypeVar, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -15,7 +16,9 @@ from torchrl.objectives import LossModule
 from torchrl_pomdp.checks import shown
 from torchrl_pomdp.tensor_checks import check_entries
 
-__all__ = ["LabelLoss", "check_batch", "check_loss", "label_of"]
+__all__ = ["LabelLoss", "check_batch", "check_loss", "label_of", "without_modes"]
+
+LossClass = TypeVar("LossClass", bound="LabelLoss")
 
 
 class LabelLoss(LossModule):
@@ -38,6 +41,16 @@ class LabelLoss(LossModule):
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
         pass
+
+
+def without_modes(loss: type[LossClass]) -> type[LossClass]:
+    """A class of losses whose ``forward`` leaves TorchRL's exploration type and recurrent mode alone.
+
+    TorchRL sets both around every loss. They belong to the whole process: where parts are trained in threads, one puts back
+    what another had set, and actors would draw nothing from then on. Losses on labels draw nothing and need neither.
+    """
+    cast(Any, loss).forward = cast(Any, loss.forward).__wrapped__
+    return loss
 
 
 def check_batch(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> TensorDictBase:

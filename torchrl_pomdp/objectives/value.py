@@ -12,11 +12,12 @@ from tensordict.utils import NestedKey
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.modules import ClosedFormCost
 from torchrl_pomdp.modules.rollout import check_finite
-from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of
+from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, without_modes
 
 __all__ = ["ValueLoss"]
 
 
+@without_modes
 class ValueLoss(LabelLoss):
     r"""Mean squared error of a cost approximation :math:`\hat J(y,r)` against simulated costs, relative to a scale.
 
