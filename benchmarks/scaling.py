@@ -26,8 +26,8 @@ from torchrl_pomdp.trainers.parts import PartImages, PartJob
 from torchrl_pomdp.workers import LOCAL, Workers
 
 # A step of the startgame of linear20: its parts, and the labelled states of each.
-PARTS, STATES, BLOCK = 3, 3072, 256
-CONFIG = PolicyIterationConfig(samples_per_part=STATES, epochs=6, least_steps=2000)
+PARTS, STATES, BLOCK = 3, 15_360, 256
+CONFIG = PolicyIterationConfig(samples_per_part=STATES, epochs=1, least_steps=600)
 # Of a cluster: 10 Gbit/s into each machine.
 BANDWIDTH = 1.25e9
 

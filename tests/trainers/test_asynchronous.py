@@ -9,6 +9,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchrl_pomdp.collectors import StateMemory
+from torchrl_pomdp.collectors.labels import Block
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.problems import make_problem
@@ -66,6 +68,41 @@ def test_the_best_policy_is_one_that_was_accepted(line3):
     run = asynchronously(line3, base=UrgencyRepair)
     assert [iteration.accepted for iteration in run] == [False, False]
     assert run.best is run.run.base_policy
+
+
+def test_parts_visit_with_the_freshest_networks(line3, monkeypatch):
+    """Each part makes its share of the visits before it labels for a version after the first."""
+    run, visits = asynchronously(line3, staleness=0), []
+    visit = run.run.memory.visit.__func__
+
+    def seen(memory, policy, start, keys, **options):
+        visits.append((policy, keys))
+        visit(memory, policy, start, keys, **options)
+
+    monkeypatch.setattr(StateMemory, "visit", seen)
+    first, _ = run
+    assert visits[0][0] is run.run.base_policy
+    assert len(visits) == 7
+    assert all(isinstance(network, LocalNetwork) for policy, _ in visits[1:] for network in policy.policies)
+    shares = torch.cat([keys for _, keys in visits[1:]]).tolist()
+    assert len(shares) == len(set(shares)) == len(visits[0][1])
+    assert not set(shares) & set(visits[0][1].tolist())
+    fresh = [weights(network) for network in first.policy.policies]
+    assert any([weights(network) for network in policy.policies] == fresh for policy, _ in visits[1:])
+
+
+def test_no_part_learns_from_images_of_older_labels():
+    blocks = [Block("a", (1, 1, 0)), Block("b", (1, 0, 1))]
+    labels = [
+        asynchronous._Labels(2, [(0, blocks[0]), (1, blocks[1])]),
+        asynchronous._Labels(1, [(0, blocks[0])]),
+        asynchronous._Labels(3, [(0, blocks[0]), (0, blocks[1]), (0, blocks[0])]),
+    ]
+    state = asynchronous._Progress([[], [], []], labels)
+    assert state.images(1, 1, 0) == [(0, blocks[0]), (2, blocks[0]), (2, blocks[0])]
+    assert state.images(0, 2, 0) == [(2, blocks[0]), (2, blocks[1]), (2, blocks[0])]
+    assert state.images(0, 2, 1) == []
+    assert state.images(2, 2, 1) == [(0, blocks[1])]
 
 
 class Killed(BaseException):

@@ -1,8 +1,8 @@
 r"""Asynchronous policy iteration: every part at its own pace (paper, Section V; Bertsekas and Yu, 2010).
 
-A part labels states with the rollout of the freshest published networks of all parts, and trains its own on them and on mirror
-images of what other parts have learnt from. It publishes them as its next version, and goes on. No part waits for another one
-but for a bound: it may be at most so many versions ahead.
+A part follows the freshest published networks of all parts, labels states with their rollout, and trains its own network on
+them and on mirror images of what other parts have labelled for the same version or a later one. It publishes it as its next
+version, and goes on. No part waits for another one but for a bound: it may be at most so many versions ahead.
 """
 
 from __future__ import annotations
@@ -62,14 +62,21 @@ class _Networks:
     records: dict[str, PartRecord] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Labels:
+    """What a part has labelled for its version ``number``, by the step of the plan."""
+
+    number: int = 0
+    blocks: list[tuple[int, Block]] = field(default_factory=list)
+
+
 @dataclass
 class _Progress:
     """What the threads of an iteration share, under one lock.
 
     Attributes:
         networks: all versions of every part.
-        learnt: what the last version of every part has learnt from, by the step of the plan: mirror images of it lie in other
-            parts.
+        labels: the last ones of every part: mirror images of them lie in other parts.
         published: see :class:`AsynchronousIteration`.
         met: the versions that each iteration has, of all parts.
         failure: what has stopped a part.
@@ -77,7 +84,7 @@ class _Progress:
     """
 
     networks: list[list[_Networks]]
-    learnt: list[list[tuple[int, Block]]]
+    labels: list[_Labels]
     published: list[Version] = field(default_factory=list)
     met: list[list[int]] = field(default_factory=list)
     failure: BaseException | None = None
@@ -86,6 +93,11 @@ class _Progress:
     def versions(self) -> list[int]:
         """The last version of each part."""
         return [len(own) - 1 for own in self.networks]
+
+    def images(self, part: int, number: int, index: int) -> list[tuple[int, Block]]:
+        """What other parts have labelled for a step of the plan with mirror images in a part, and not for an older version."""
+        others = [(other, own) for other, own in enumerate(self.labels) if other != part and own.number >= number]
+        return [(p, block) for p, own in others for at, block in list(own.blocks) if at == index and block.summary[part]]
 
     def meet(self) -> bool:
         """Note an iteration if all parts have come further; whether they have."""
@@ -144,7 +156,7 @@ class AsynchronousIteration:
         run._start()
         base = _Networks(run.base_policy, run._scale)
         parts = range(run.partition.num_parts)
-        state = _Progress([[base] for _ in parts], [[] for _ in parts])
+        state = _Progress([[base] for _ in parts], [_Labels() for _ in parts])
         self.best, self.published = run.best, state.published
         return state
 
@@ -173,8 +185,6 @@ class AsynchronousIteration:
                 accepted, reason = judge(comparison)
                 if accepted:
                     self.best, best_costs = policy, costs
-                if number < run.config.iterations:
-                    run._visit(policy, number)
                 since = [own[first + 1 : last + 1] for own, first, last in zip(state.networks, before, met, strict=True)]
                 records = {name: record for own in since for made in own for name, record in made.records.items()}
                 before = met
@@ -207,13 +217,12 @@ class AsynchronousIteration:
                 with self._changed:
                     self._changed.wait_for(partial(self._may_begin, number, state))
                     used = state.versions()
-                    freshest, others = [own[-1] for own in state.networks], list(state.learnt)
-                made = None if state.stopped else self._version(part, number, freshest, others, state)
+                    freshest, state.labels[part] = [own[-1] for own in state.networks], _Labels(number)
+                networks = None if state.stopped else self._version(part, number, freshest, state)
                 with self._changed:
                     # Who was told to stop meanwhile leaves the folder to others.
-                    if made is None or state.stopped:
+                    if networks is None or state.stopped:
                         return
-                    networks, state.learnt[part] = made
                     version = Version(part, number, tuple(used))
                     self._keep(version, networks)
                     state.networks[part].append(networks)
@@ -226,12 +235,13 @@ class AsynchronousIteration:
                 state.failure = error
                 self._changed.notify_all()
 
-    def _version(
-        self, part: int, number: int, freshest: list[_Networks], others: list[list[tuple[int, Block]]], state: _Progress
-    ) -> tuple[_Networks, list[tuple[int, Block]]] | None:
-        """Networks that a part learns from the freshest of all parts, and from what; None if it has been stopped."""
-        run, records, learnt = self.run, {}, []
+    def _version(self, part: int, number: int, freshest: list[_Networks], state: _Progress) -> _Networks | None:
+        """Networks that a part learns from the freshest of all parts; None if it has been stopped."""
+        run, records = self.run, {}
         local, values = [own.policy for own in freshest], [own.value for own in freshest]
+        if number > 1:
+            # Where the policy goes now. The base policy's states are there from the beginning.
+            run._visit(PartitionedPolicy(local), number - 1, part)
         for index, step in enumerate(run.plan):
             if part not in step.parts:
                 continue
@@ -244,18 +254,16 @@ class AsynchronousIteration:
             for block in collector.blocks(run.workers, run._images.counts):
                 if state.stopped:
                     return None
-                learnt.append((index, block))
+                state.labels[part].blocks.append((index, block))
                 if block.summary[part]:
                     training.add(part, block.handle)
-            for other, blocks in enumerate(others):
-                for at, block in blocks if other != part else []:
-                    if at == index and block.summary[part]:
-                        training.add(other, block.handle)
+            for other, block in state.images(part, number, index):
+                training.add(other, block.handle)
             trained = run.workers.trained({part: training})[part]
             network.load_state_dict(trained.weights)
             (local if isinstance(step, Improve) else values)[part] = network.eval()
             records[name] = PartRecord.of(collector, trained)
-        return _Networks(local[part], values[part], records), learnt
+        return _Networks(local[part], values[part], records)
 
     # ---- the folder --------------------------------------------------------------------------------------------------
 

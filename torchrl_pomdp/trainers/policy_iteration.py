@@ -342,11 +342,16 @@ class PolicyIteration:
         rollout = MultiagentRollout if self._multiagent else RolloutPolicy
         return RolloutImprovement(env, policy, label=partial(rollout, **simulation), **options)
 
-    def _visit(self, policy: TensorDictModuleBase, number: int) -> None:
-        """Remember states that an iteration's policy visits, also a rejected one's: there the next one can do better."""
+    def _visit(self, policy: TensorDictModuleBase, number: int, part: int | None = None) -> None:
+        """Remember states that an iteration's policy visits, also a rejected one's: there the next one can do better.
+
+        A part at its own pace makes its share of the visits.
+        """
         config = self.config
         count = math.ceil(config.visits_per_label * config.samples_per_part * self.partition.num_parts)
         keys = seed_keys(self._seed(number, "visits"), torch.arange(count, device=self.problem.model.device))
+        if part is not None:
+            keys = keys[part :: self.partition.num_parts]
         options: dict[str, Any] = {"exploration": config.exploration, "max_steps": config.max_steps, "workers": self.workers}
         self.memory.visit(policy, self.problem.start, keys, **options)
 
