@@ -43,7 +43,8 @@ def test_train_evaluate_and_resume(tmp_path, capsys, algorithm):
     best = load_checkpoint(out / "best.pt")
     assert list(metrics)[:-1] == ["greedy", "urgency", "R-NT of greedy", *truncated, f"{algorithm} 1"]
     assert list(metrics)[-1] == f"{best.name} + R-NT"
-    assert ("no iteration was accepted" in text.splitlines()[-1]) == (best.iteration == 0)
+    last = "no iteration was accepted: best.pt" if best.iteration == 0 else f"best policy: {best.name}, {out / 'best.pt'}. "
+    assert text.splitlines()[-1].startswith(last)
     assert metrics["greedy"]["ratio"]["mean"] == 1.0
     (iteration,) = json.loads((out / "iterations.json").read_text())
     assert iteration["accepted"] in (True, False)

@@ -38,7 +38,7 @@ import torch
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_seed, check_sequence
-from torchrl_pomdp.pictures import new_figure
+from torchrl_pomdp.pictures import COLOURS, new_figure
 from torchrl_pomdp.planners.belief_mdp import BeliefMDP, belief_mdp
 from torchrl_pomdp.problems.random_tabular import random_model
 from torchrl_pomdp.report import draw
@@ -199,6 +199,7 @@ def bounds_figure(results: Sequence[ErrorBounds]) -> Figure:
     figure = new_figure(4.0 * len(sides), 3.8)
     for number, (title, by_lookahead) in enumerate(sides.items(), 1):
         axes = figure.add_subplot(1, len(sides), number)
+        axes.set_prop_cycle(color=COLOURS)
         for lookahead, pairs in sorted(by_lookahead.items()):
             axes.loglog(*zip(*pairs, strict=True), ".", ms=4, alpha=0.6, label=rf"$\ell={lookahead}$")
         every = [value for pairs in by_lookahead.values() for pair in pairs for value in pair] or [1.0]

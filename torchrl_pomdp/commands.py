@@ -69,6 +69,11 @@ def train(command: Train) -> None:
             f"no iteration was accepted: best.pt is the base policy, {best.name}. What usually helps: more --samples-per-part, "
             "more --validation-states, more --trajectories"
         )
+    else:
+        print(
+            f"best policy: {best.name}, {out / 'best.pt'}. Compare it, or improve it online: torchrl-pomdp evaluate "
+            f"{out / 'best.pt'} --online. On a robot: torchrl_pomdp.controller.Controller.from_checkpoint"
+        )
 
 
 def _workers(command: Train) -> AbstractContextManager[Workers]:

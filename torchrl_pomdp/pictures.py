@@ -1,4 +1,4 @@
-"""An empty figure; matplotlib, the extra ``plot``, is imported when one is made."""
+"""An empty figure, and colours; matplotlib, the extra ``plot``, is imported when one is made."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["new_figure"]
+__all__ = ["COLOURS", "new_figure"]
+
+# Colours of lines and markers, told apart by colour-blind people too (Okabe and Ito, 2008).
+COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#000000")
 
 
 def new_figure(width: float, height: float) -> Figure:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from torchrl_pomdp.checks import check_callable, check_instance, check_mapping, check_sequence
 from torchrl_pomdp.evaluation import Comparison, Estimate
 from torchrl_pomdp.files import write_bytes
-from torchrl_pomdp.pictures import new_figure
+from torchrl_pomdp.pictures import COLOURS, new_figure
 from torchrl_pomdp.report.effort import check_iterations, effort
 from torchrl_pomdp.report.tables import Result, half_width, ratio_texts
 
@@ -87,6 +87,7 @@ def iteration_figure(lines: Mapping[str, Sequence[Comparison]]) -> Figure:
         check_sequence(f"lines[{name!r}]", comparisons, Comparison)
     figure = new_figure(6.0, 3.8)
     axes = figure.add_subplot()
+    axes.set_prop_cycle(color=COLOURS)
     for number, (name, comparisons) in enumerate(lines.items()):
         # Where a ratio means nothing there is a gap.
         ratios = [comparison.ratio or Estimate(math.nan, math.nan, 0) for comparison in comparisons]

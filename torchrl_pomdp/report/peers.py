@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_pomdp.checks import check_instance, check_mapping, check_number, check_sequence, check_text
 from torchrl_pomdp.evaluation import Comparison
-from torchrl_pomdp.pictures import new_figure
+from torchrl_pomdp.pictures import COLOURS, new_figure
 from torchrl_pomdp.report.tables import half_width, interval_text, ratio_texts
 
 if TYPE_CHECKING:
@@ -101,8 +101,8 @@ def peer_figure(outcomes: Mapping[str, Outcome], title: str = "") -> Figure:
                 value.mean,
                 yerr=half_width(value),
                 marker="osD^v<>PX*"[number % 10],
-                color=f"C{number % 10}",
-                mfc=f"C{number % 10}" if number < 10 else "white",
+                color=(colour := COLOURS[number % len(COLOURS)]),
+                mfc=colour if number < 10 else "white",
                 capsize=4,
                 linestyle="none",
                 label=name,
