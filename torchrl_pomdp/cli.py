@@ -192,7 +192,14 @@ def main(args: list[str] | None = None) -> int:
         | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
         | Annotated[Problems, tyro.conf.subcommand("problems")]
     )
-    command: Train | Evaluate | Compare | Changes | Reproduce | Problems = tyro.cli(choices, prog="torchrl-pomdp", args=args)
+    about = (
+        "Policies for very large POMDPs by lookahead, rollout and partitioned policy iteration. "
+        "`torchrl-pomdp COMMAND --help` lists the options of a command; "
+        "`--tyro-print-completion bash` (or zsh, tcsh) prints the completion for a shell."
+    )
+    command: Train | Evaluate | Compare | Changes | Reproduce | Problems = tyro.cli(
+        choices, prog="torchrl-pomdp", description=about, args=args
+    )
     from torchrl import logger
 
     from torchrl_pomdp import commands
