@@ -5,4 +5,14 @@ Rollout and Policy Iteration with Application to Autonomous Sequential Repair Pr
 paper" in all docstrings.
 """
 
+import sys
+
 __version__ = "0.1.0"
+
+# A library that is not installed has no entry point; one that is has registered its ids when Gymnasium was imported.
+if "gymnasium.envs.registration" in sys.modules:
+    from torchrl_pomdp.gym_ids import register
+
+    register()
+    del register
+del sys
