@@ -5,14 +5,9 @@ Rollout and Policy Iteration with Application to Autonomous Sequential Repair Pr
 paper" in all docstrings.
 """
 
-import sys
+from torchrl_pomdp.gym_ids import register
 
 __version__ = "0.1.0"
 
-# A library that is not installed has no entry point; one that is has registered its ids when Gymnasium was imported.
-if "gymnasium.envs.registration" in sys.modules:
-    from torchrl_pomdp.gym_ids import register
-
-    register()
-    del register
-del sys
+register()
+del register

@@ -46,18 +46,19 @@ def check_render_mode(value: Any, simulation: Simulation, modes: list[str]) -> s
 
 
 def figure_pixels(figure: Figure) -> np.ndarray:
-    """A figure as pixels, uint8 ``[height, width, 3]``.
+    """A figure as pixels, uint8 ``[height, width, 3]``; both sizes are even, as codecs of videos want it.
 
     Examples:
         >>> from torchrl_pomdp.pictures import new_figure
-        >>> figure_pixels(new_figure(1.0, 0.5)).shape
-        (60, 120, 3)
+        >>> figure_pixels(new_figure(1.0, 0.51)).shape
+        (62, 120, 3)
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return np.array(canvas.buffer_rgba())[..., :3].copy()
+    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    return np.pad(pixels, ((0, pixels.shape[0] % 2), (0, pixels.shape[1] % 2), (0, 0)), mode="edge")
 
 
 class Window:

@@ -22,6 +22,8 @@ __all__ = ["PomdpEnv"]
 
 # Of the keys of episodes, which are drawn.
 KEYS = -(2**62), 2**62
+# Characters of the controls in a title; those of very many robots are left out.
+_LONGEST = 60
 
 
 class PomdpEnv(gymnasium.Env):
@@ -107,7 +109,7 @@ class PomdpEnv(gymnasium.Env):
         if self.render_mode is None:
             gymnasium.logger.warn('render() draws nothing: give render_mode="rgb_array" or "human" to gymnasium.make')
             return None
-        after = f" after {self._last}" if self._last else ""
+        after = f", after {self._last}" if 0 < len(self._last) <= _LONGEST else ""
         pixels = figure_pixels(self.simulation.figure(state, f"stage {self._stage}{after}\ncost so far {self._cost:.5g}"))
         if self.render_mode == "rgb_array":
             return pixels

@@ -111,7 +111,7 @@ class PomdpVectorEnv(VectorEnv):
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Play controls ``[N]`` or ``[N, R]``: observations, rewards float64 ``[N]``, terminated, truncated, and infos."""
-        state, ended = self._now(), self._ended
+        state, ended = self._now(), self._ended.clone()
         u = controls_of(actions, (self.num_envs, *self.model.control_shape), self.model.device)
         legal = self.simulation.legal(state)
         # Rows whose episode has ended start anew below; until then they take any legal control.
