@@ -78,11 +78,11 @@ def test_ended_rows_start_anew_in_the_next_step_whatever_their_control():
     # The rows end at different stages: one is started anew alone.
     envs.step(envs.action_space.sample())
     _, info = envs.reset(seed=[None, 7, None], options={"reset_mask": np.array([False, True, False])})
-    observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
+    _, reward, _, truncated, info = envs.step(envs.action_space.sample())
     assert truncated.tolist() == [True, False, True]
     assert (reward < 0).all()
     controls = np.where([True, False, True], info["action_mask"].argmin(-1), info["action_mask"].argmax(-1))
-    observation, reward, terminated, truncated, info = envs.step(controls)
+    observation, reward, _, truncated, _ = envs.step(controls)
     assert (reward < 0).tolist() == [False, True, False]
     assert truncated.tolist() == [False, True, False]
     first = gymnasium.make(BELIEFS, problem="line3")
@@ -139,6 +139,17 @@ def test_seeds():
     assert not np.array_equal(one.reset()[0]["belief"], two.reset()[0]["belief"])
     with pytest.raises(ValueError, match="seed must be one number, or 3 of them"):
         envs.reset(seed=[1, 2])
+
+
+def test_start_and_steps_have_noise_of_their_own():
+    """The first observation has the model's law, whatever the hidden state was drawn from."""
+    envs = make(OBSERVATIONS, "tiger", num_envs=4000)
+    envs.reset(seed=0)
+    heard, *_ = envs.step(np.zeros(4000, int))
+    state = envs.unwrapped._state["state"].numpy()
+    for each in (0, 1):
+        right = (heard == each)[state == each]
+        assert right.mean() == pytest.approx(0.85, abs=4 * np.sqrt(0.85 * 0.15 / right.size))
 
 
 def test_realised_costs_have_the_mean_of_expected_costs():

@@ -24,6 +24,8 @@ from torchrl_pomdp.envs.rows import put_rows
 
 __all__ = ["PomdpVectorEnv"]
 
+_MOST_ENVS = 1_000_000
+
 
 class PomdpVectorEnv(VectorEnv):
     """Gymnasium vector environment whose N episodes are one batch of the model; what ``gymnasium.make_vec`` makes.
@@ -37,13 +39,13 @@ class PomdpVectorEnv(VectorEnv):
 
     Args:
         simulation: what is played.
-        num_envs: N.
+        num_envs: N, at most a million.
         max_episode_steps: stages after which an episode is truncated; None: never.
         render_mode: ``"rgb_array"`` or None.
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if a number is not positive, or the problem cannot be rendered so; by ``reset`` if a seed is negative or
+        ValueError: if a number is out of bounds, or the problem cannot be rendered so; by ``reset`` if a seed is negative or
             there are not N of them; by ``step`` if a control is illegal.
 
     Examples:
@@ -71,9 +73,9 @@ class PomdpVectorEnv(VectorEnv):
         render_mode: str | None = None,
     ) -> None:
         self.simulation: Simulation = check_instance("simulation", simulation, Simulation)
-        self.num_envs = check_integer("num_envs", num_envs, 1)
-        limit = None if max_episode_steps is None else check_integer("max_episode_steps", max_episode_steps, 1)
-        self.max_episode_steps = limit
+        self.num_envs = check_integer("num_envs", num_envs, 1, _MOST_ENVS)
+        limited = max_episode_steps is not None
+        self.max_episode_steps = check_integer("max_episode_steps", max_episode_steps, 1, 2**62) if limited else None
         self.metadata = {**self.metadata, "render_modes": ["rgb_array"] if simulation.has_figure else []}
         self.render_mode = check_render_mode(render_mode, simulation, self.metadata["render_modes"])
         self.single_observation_space = simulation.observation_space
