@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["BeliefSimulation", "Simulation", "WorldSimulation"]
 
+# What an episode's key is for beside its start, see torchrl_pomdp.envs.world.
+_STAGES = 12
+
 
 class Simulation(ABC):
     """Pure functions of the states ``[*B]`` of running episodes, and what an agent is shown of them.
@@ -86,8 +89,8 @@ class BeliefSimulation(Simulation):
         >>> problem = tiger()
         >>> simulation, keys = BeliefSimulation(problem.model, problem.start), torch.arange(2)
         >>> cost, state = simulation.step(simulation.start(keys), torch.tensor([0, 0]), keys)
-        >>> cost.tolist(), simulation.observed(state)["belief"].round(2).tolist()
-        ([1.0, 1.0], [[0.8500000238418579, 0.15000000596046448], [0.15000000596046448, 0.8500000238418579]])
+        >>> cost.tolist(), simulation.observed(state)["belief"].round(2)
+        ([1.0, 1.0], array([[0.15, 0.85], [0.15, 0.85]], dtype=float32))
     """
 
     observation_space: spaces.Dict
@@ -143,7 +146,7 @@ class WorldSimulation(Simulation):
         >>> simulation, keys = WorldSimulation(problem.model, problem.start), torch.arange(3)
         >>> start = simulation.start(keys)
         >>> simulation.observed(start), simulation.observed(simulation.step(start, torch.zeros_like(keys), keys)[1])
-        (array([2, 2, 2]), array([0, 0, 0]))
+        (array([2, 2, 2]), array([1, 1, 1]))
     """
 
     def __init__(self, model: BeliefModel, generator: StateGenerator) -> None:
@@ -190,7 +193,3 @@ class WorldSimulation(Simulation):
 def stage_keys(keys: Tensor, stage: Tensor) -> Tensor:
     """Keys ``[*B]`` of the steps at stages int64 ``[*B]`` of the episodes of keys ``[*B]``, other ones than of their starts."""
     return fold(fold(keys, _STAGES), stage)
-
-
-# What an episode's key is for beside its start, see torchrl_pomdp.envs.world.
-_STAGES = 12

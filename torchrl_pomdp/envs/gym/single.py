@@ -58,7 +58,7 @@ class PomdpEnv(gymnasium.Env):
         (['belief', 'location'], [1, 0, 1])
         >>> observation, reward, terminated, truncated, info = env.step(0)
         >>> round(reward, 2), terminated
-        (-100.2, False)
+        (-44.54, False)
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": FRAMES_PER_SECOND}
