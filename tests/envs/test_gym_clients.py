@@ -13,10 +13,10 @@ STAGES = 50
 
 
 def costs(agent, seed=1000):
-    """Discounted costs of 200 episodes."""
-    envs = gymnasium.make_vec(BELIEFS, num_envs=200, problem="line3", max_episode_steps=STAGES)
+    """Discounted costs of 100 episodes."""
+    envs = gymnasium.make_vec(BELIEFS, num_envs=100, problem="line3", max_episode_steps=STAGES)
     observation, info = envs.reset(seed=seed)
-    total, live, discount = np.zeros(200), np.ones(200, bool), envs.unwrapped.model.discount
+    total, live, discount = np.zeros(100), np.ones(100, bool), envs.unwrapped.model.discount
     for stage in range(STAGES):
         controls, _ = agent.predict(observation, action_masks=info["action_mask"], deterministic=True)
         observation, reward, terminated, truncated, info = envs.step(controls)
@@ -25,15 +25,17 @@ def costs(agent, seed=1000):
     return total
 
 
-def test_maskable_ppo_learns():
+def test_maskable_ppo_learns(tmp_path):
     sb3 = pytest.importorskip("sb3_contrib")
     env = gymnasium.make(BELIEFS, problem="line3", max_episode_steps=STAGES)
-    numbers = {"n_steps": 256, "batch_size": 64, "gamma": env.unwrapped.model.discount, "learning_rate": 1e-3}
+    numbers = {"n_steps": 256, "batch_size": 64, "n_epochs": 4, "gamma": env.unwrapped.model.discount, "learning_rate": 1e-3}
     agent = sb3.MaskablePPO("MultiInputPolicy", env, seed=0, device="cpu", **numbers)
     untrained = costs(agent)
     agent.learn(2048)
-    trained = costs(agent)
-    assert trained.mean() < 0.7 * untrained.mean()
+    # What is saved can be played without the environment.
+    agent.save(tmp_path / "agent")
+    trained = costs(sb3.MaskablePPO.load(tmp_path / "agent"))
+    assert trained.mean() < 0.5 * untrained.mean()
 
 
 @pytest.mark.parametrize(("id", "problem"), [(OBSERVATIONS, "line3"), (BELIEFS, "network32x8"), (OBSERVATIONS, "network32x8")])
