@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 from _hostile import Hostile
 from _refusals_exact import EXACT
+from _refusals_gym import GYM
 from _refusals_peers import PEERS
 from _refusals_planning import ENVS, MODULES
 from _refusals_problems import PROBLEMS
@@ -36,13 +37,13 @@ CASES: dict[str, Callable[[Path], Case]] = {
     **REPORTS,
     **FILES,
 }
-CASES |= EXACT | PEERS
+CASES |= EXACT | PEERS | GYM
 
 PUBLIC = (
     *("envs", "envs.repair", "modules", "modules.repair", "problems"),
     *("collectors", "objectives", "trainers", "trainers.run"),
     *("controller", "evaluation", "noise", "report", "reproduce", "files", "checks", "tensor_checks", "identity"),
-    *("planners", "bounds", "changes"),
+    *("planners", "bounds", "changes", "envs.gym", "problems.gym"),
 )
 
 # What is not tried, and why.
@@ -50,7 +51,7 @@ EXEMPT = {
     "names of types": "*.Policy *.TerminalCost *.StateGenerator *.StateSampler *.OnLabels problems.Symmetry",
     "tables and constants": "*.PRESETS *.REPAIR *.ALGORITHMS *.BASE_POLICIES *.EXPERIMENTS *.OPTIMA *.PUBLISHED *_SEED",
     "abstract, tried by what they are bases of": "envs.Partition modules.Encoder modules.AgentEncoder modules.ClosedFormCost "
-    "modules.Truncation",
+    "envs.gym.Simulation modules.Truncation",
     "made by the library, not by its users": "*.Comparison *.Estimate *.Iteration *.PartRecord *.Effort *.DamagedFileError "
     "*.PartitionReport *.Change *.Version *.Decision *.Interval *.Solution *.ErrorBounds",
     "run at every belief step, on what was checked before": "noise.fold noise.uniform noise.fingerprint noise.permuted",

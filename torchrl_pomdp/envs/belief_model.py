@@ -27,6 +27,8 @@ from torchrl_pomdp.noise import fingerprint
 from torchrl_pomdp.tensor_checks import check_keys
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from torchrl_pomdp.envs.world import World
 
 __all__ = ["INSIGNIFICANT", "BeliefModel", "StateGenerator", "generated"]
@@ -151,6 +153,11 @@ class BeliefModel(JointControls, ABC):
                     f"a model stays on its device {self.device} and in its type {self.dtype}; build the model {what}"
                 )
         return super()._apply(fn, recurse)
+
+    @property
+    def observation_digits(self) -> tuple[int, int]:
+        """Base and count of the numbers that make an observation, such as what each robot sees; here one number below Z."""
+        return self.num_observations, 1
 
     @property
     @abstractmethod
@@ -326,6 +333,10 @@ class BeliefModel(JointControls, ABC):
             ['level', 'location']
         """
         raise TypeError(f"model has no hidden states: {type(self).__name__} must override world(), giving a World")
+
+    def figure(self, y: TensorDictBase, title: str = "") -> Figure:
+        """A picture of a feature state, of batch ``()``; most models have none and raise a ``TypeError``."""
+        raise TypeError(f"model has no picture: {type(self).__name__} must override figure()")
 
     # ---- what a real robot does and reports, see torchrl_pomdp.controller ---------------------------------------------
 

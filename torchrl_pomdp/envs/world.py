@@ -15,6 +15,8 @@ from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import check_keys
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from torchrl_pomdp.envs.belief_model import BeliefModel
 
 __all__ = ["World"]
@@ -86,6 +88,10 @@ class World(ABC):
     @abstractmethod
     def advance(self, hidden: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase, Tensor]:
         """Cost, next hidden state and observation by uniforms in [0, 1), ``[*B, noise_dim]``; see :meth:`step`."""
+
+    def figure(self, hidden: TensorDictBase, title: str = "") -> Figure:
+        """A picture of a hidden state, of batch ``()``; most worlds have none and raise a ``TypeError``."""
+        raise TypeError(f"world has no picture: {type(self).__name__} must override figure()")
 
     # ---- what callers use --------------------------------------------------------------------------------------------
 

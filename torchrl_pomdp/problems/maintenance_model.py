@@ -156,6 +156,11 @@ class MaintenanceModel(BeliefModel):
         """Type of beliefs and costs."""
         return self.chain.dtype
 
+    @property
+    def observation_digits(self) -> tuple[int, int]:
+        """K and n: each component reports a level."""
+        return self.num_levels, self.num_components
+
     def state_spec(self, batch_size: torch.Size | tuple[int, ...] = ()) -> Composite:
         """``belief`` ``[*B, n, K]`` in [0, 1] and ``time`` ``[*B]``."""
         shape = torch.Size(batch_size)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -12,6 +14,9 @@ from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.envs.world import World
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["RepairWorld"]
 
@@ -82,6 +87,12 @@ class RepairWorld(World):
         level = inverse_cdf(torch.where((repairs > 0).unsqueeze(-1), after, law), noise)
         location = model.destinations[location, controls]
         return cost, self._hidden(level, location), joined(level.gather(-1, location), model.num_levels)
+
+    def figure(self, hidden: TensorDictBase, title: str = "") -> Figure:
+        """The true levels on the graph, drawn as the model draws a belief that knows them."""
+        belief = torch.nn.functional.one_hot(hidden.get("level"), self.model.num_levels).to(self.model.dtype)
+        known = {"belief": belief, "location": hidden.get("location")}
+        return self.model.figure(TensorDict(known, batch_size=hidden.batch_size, device=self.model.device), title)
 
     def _of_level(self, table: Tensor, level: Tensor) -> Tensor:
         """Entries of costs or chain for levels ``[*B, L]``."""
