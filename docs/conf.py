@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
 from typing import Any
 
 import latex2mathml.converter
@@ -16,7 +18,12 @@ project_copyright = author
 release = torchrl_pomdp.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-# `results` and `tutorials` are links to the folders of the repository. Tables are linked, but are no pages of their own.
+# Results and notebooks are pages too: Sphinx wants them below its own folder.
+HERE = Path(__file__).parent
+for name in ("results", "tutorials"):
+    shutil.rmtree(HERE / name, ignore_errors=True)
+    shutil.copytree(HERE.parent / name, HERE / name, ignore=shutil.ignore_patterns("*.py", "*.json"))
+# Tables that the pages of results show already.
 exclude_patterns = ["_build", "results/*/*-scale*.md", "results/compare/compare-*.md", "results/proposition1/proposition1.md"]
 exclude_patterns += ["results/changes/model-changes.md"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb", ".rst": "restructuredtext"}
