@@ -14,6 +14,7 @@ from nbclient import NotebookClient
 from tensordict import TensorDict
 from test_fuzz import PUBLIC
 
+from torchrl_pomdp import __version__
 from torchrl_pomdp.controller import Controller
 from torchrl_pomdp.envs import BeliefEnv, BeliefModel, FunctionPartition, TabularModel
 from torchrl_pomdp.modules import Myopic, OnEntering, RolloutPolicy, ZeroCost
@@ -133,6 +134,11 @@ def test_the_readme_is_short_and_links_its_pages():
 def test_every_public_name_has_a_reference():
     reference = "".join(page.read_text() for page in (ROOT / "docs" / "api").glob("*.md"))
     assert [module for module in PUBLIC if f".. automodule:: torchrl_pomdp.{module}\n" not in reference] == []
+
+
+def test_the_version_to_cite_is_the_library_s():
+    for document in ("CITATION.cff", "docs/cite.md"):
+        assert re.search(rf"^ *version *[:=] *\{{?{re.escape(__version__)}\}}?$", (ROOT / document).read_text(), re.MULTILINE)
 
 
 class Own(BeliefModel):
