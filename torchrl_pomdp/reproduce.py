@@ -273,8 +273,9 @@ def reproduce(
     check_callable("report", report)
     check_callable("tell", tell)
     device = check_device("device", device)
-    runs, out = check_folder("runs", runs), check_folder("out", out) / experiment.name
+    runs, out = check_folder("runs", runs), check_folder("out", out)
     planned = plan(experiment, settings, base, scale, seed, problems, device)
+    out = out / experiment.name
     results: dict[str, dict[str, Comparison]] = {}
     iterations: dict[str, list[dict[str, Any]]] = {}
     costs: dict[str, dict[str, Tensor]] = {}
