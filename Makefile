@@ -1,5 +1,5 @@
 .DELETE_ON_ERROR:
-.PHONY: demo test lint tutorials benchmarks
+.PHONY: demo test lint tutorials docs benchmarks
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -22,10 +22,18 @@ tutorials: .venv/installed
 	$(BIN)/jupytext --to ipynb tutorials/*.py
 	$(BIN)/jupyter-execute --inplace tutorials/*.ipynb
 
+# The documentation as HTML in docs/_build/html; warnings are errors, and nothing is fetched.
+docs: .venv/installed-docs
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+
 benchmarks: .venv/installed
 	$(BIN)/python -m benchmarks
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+.venv/installed-docs: .venv/installed
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	touch $@

@@ -50,7 +50,7 @@ def test_gains_are_paired_with_the_old_policy(wall):
 
 def test_the_command_writes_a_table(wall, tmp_path, capsys):
     assert cli.main(["changes", "--states", "4", "--trajectories", "2", "--out", str(tmp_path)]) == 0
-    text = (tmp_path / "model-changes.md").read_text()
+    text = (tmp_path / "changes" / "model-changes.md").read_text()
     assert text.startswith("a wall, 4 start states, ratios to the old policy")
     assert "| rollout of it |" in text
     assert text.strip() in capsys.readouterr().out

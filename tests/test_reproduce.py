@@ -82,19 +82,19 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
     assert told[0] == text
     assert told[1].startswith("pictures: ")
     stem = "toy-tuned-urgency-scale0.001-seed0"
-    content = json.loads((tmp_path / "results" / f"{stem}.json").read_text())
+    content = json.loads((tmp_path / "results" / "toy" / f"{stem}.json").read_text())
     assert content["provenance"]["versions"]["torch"] == torch.__version__
     assert content["provenance"]["commit"] == provenance()["commit"]
     assert {run["algorithm"] for run in content["runs"].values()} == {"pAPI-NT", "pAPI-T"}
     for name, found in content["results"].items():
         assert {"greedy", "urgency"} <= set(found)
         assert len(content["iterations"][name]) == 1
-    assert (tmp_path / "results" / f"{stem}.md").read_text().strip() == text
-    pictures = {path.name.removeprefix(stem) for path in (tmp_path / "results").glob("*.png")}
+    assert (tmp_path / "results" / "toy" / f"{stem}.md").read_text().strip() == text
+    pictures = {path.name.removeprefix(stem) for path in (tmp_path / "results" / "toy").glob("*.png")}
     assert pictures == {"-iterations.png", "-time.png", "-line3-pAPI-NT.png", "-line3-pAPI-T.png"}
-    before = (tmp_path / "results" / f"{stem}.json").read_bytes()
+    before = (tmp_path / "results" / "toy" / f"{stem}.json").read_bytes()
     assert reproduce(TOY, scale=0.001, base="urgency", progress=True, **folders) == text
-    assert (tmp_path / "results" / f"{stem}.json").read_bytes() == before
+    assert (tmp_path / "results" / "toy" / f"{stem}.json").read_bytes() == before
     reproduce(TOY, scale=0.001, base="urgency", **folders)
     labels = 40 * (6 + 9)
     # Labels of an earlier run say nothing about the time that is left.

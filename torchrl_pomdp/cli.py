@@ -121,7 +121,7 @@ class Compare:
     """Folder of the comparison's own folder."""
 
     out: Path = Path("results")
-    """Folder of table, figures and numbers."""
+    """Folder of the results; table, figures and numbers go to the folder compare in it."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Reproduce:
     """Folder of the runs."""
 
     out: Path = Path("results")
-    """Folder of tables, figures and numbers."""
+    """Folder of the results; tables, figures and numbers go to the experiment's folder in it."""
 
     device: str = "cpu"
     """Device to compute on, such as cpu or cuda:0."""
@@ -169,7 +169,7 @@ class Changes:
     """Simulated trajectories of each control."""
 
     out: Path = Path("results")
-    """Folder of the table."""
+    """Folder of the results; the table goes to the folder changes in it."""
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,7 @@ def compare(command: Compare) -> None:
     problem = find_problem(command.problem, torch.device("cpu"))
     given = None if command.checkpoint is None else load_checkpoint(command.checkpoint, problem=problem)
     name = f"compare-{problem.name}-{command.seconds:g}s"
-    runs, out = check_folder("runs", command.runs), check_folder("out", command.out)
+    runs, out = check_folder("runs", command.runs), check_folder("out", command.out) / "compare"
     outcomes = compare_peers(
         problem,
         runs / name,
@@ -174,7 +174,7 @@ def compare(command: Compare) -> None:
 
 def changes(command: Changes) -> None:
     """Measure all changes of models; print the table and write it."""
-    out = check_folder("out", command.out)
+    out = check_folder("out", command.out) / "changes"
     found = measure_changes(
         command.states,
         trajectories=command.trajectories,

@@ -253,7 +253,8 @@ def reproduce(
         problems: only these problems; none: all of the experiment's.
         seed: seed of the training.
         runs: folder of the run folders.
-        out: folder of the results, ``NAME.json``, ``NAME.md`` and ``NAME-*.png``.
+        out: folder of the results; ``NAME.json``, ``NAME.md`` and ``NAME-*.png`` go to the folder in it that is called as the
+            experiment.
         device: where to compute.
         report: called with run, policy and its comparison with greedy as soon as it is known.
         tell: called with the table before pictures are drawn, then with a line that says where they are or why there are
@@ -274,6 +275,7 @@ def reproduce(
     device = check_device("device", device)
     runs, out = check_folder("runs", runs), check_folder("out", out)
     planned = plan(experiment, settings, base, scale, seed, problems, device)
+    out = out / experiment.name
     results: dict[str, dict[str, Comparison]] = {}
     iterations: dict[str, list[dict[str, Any]]] = {}
     costs: dict[str, dict[str, Tensor]] = {}

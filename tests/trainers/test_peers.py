@@ -132,10 +132,10 @@ def test_the_command_writes_table_and_pictures(line3, checkpoint, tmp_path, caps
     assert options["ppo_steps"] == 42
     assert problem_digest(options["checkpoint"].problem) == problem_digest(line3)
     name = "compare-line3-0.001s"
-    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+    assert {file.name for file in (tmp_path / "out" / "compare").iterdir()} == {
         f"{name}{end}" for end in (".json", ".md", ".png", "-time.png")
     }
-    content = json.loads((tmp_path / "out" / f"{name}.json").read_text())
+    content = json.loads((tmp_path / "out" / "compare" / f"{name}.json").read_text())
     assert list(content["outcomes"]) == ["greedy", "urgency"]
     shown = capsys.readouterr().out
     assert "| greedy |" in shown
