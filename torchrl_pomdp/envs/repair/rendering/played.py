@@ -11,12 +11,10 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_text
 from torchrl_pomdp.envs.entries import check_state_entries
 from torchrl_pomdp.envs.repair.model import RepairModel
+from torchrl_pomdp.envs.scene import control_bars
 from torchrl_pomdp.tensor_checks import check_distributions, check_tensor
 
 __all__ = ["Played", "check_moves", "expected_damage", "played"]
-
-# The most bars of a stage, of the best controls; of models with more controls than so many none, whose names are too long.
-_MOST_BARS, _MOST_CONTROLS = 8, 32
 
 
 class Played(NamedTuple):
@@ -89,19 +87,13 @@ def _bars(
     model: RepairModel, what: str, trajectory: TensorDictBase, action: Tensor
 ) -> list[list[tuple[str, float, bool]]] | None:
     """The best controls of every stage; None where the trajectory has no Q-factors, or too many."""
-    factors = trajectory.get("q_factors", None)
-    if factors is None:
+    if "q_factors" in trajectory:
+        check_tensor(f"q_factors of {what}", trajectory["q_factors"], (len(action), model.num_controls), finite=False)
+    stages = control_bars(model, trajectory)
+    if stages is None:
         return None
-    check_tensor(f"q_factors of {what}", factors, (len(action), model.num_controls), finite=False)
-    if model.num_controls > _MOST_CONTROLS:
-        return None
-    bars = []
-    for q, chosen in zip(factors.cpu(), action.tolist(), strict=True):
-        legal = torch.isfinite(q).nonzero().flatten()
-        best = sorted(legal[q[legal].argsort(stable=True)][:_MOST_BARS].tolist())
-        names = [", ".join(model.shown_control(torch.tensor(u, device=model.device))) for u in best]
-        bars.append([(name, float(q[u] - q[best].min()), u == chosen) for name, u in zip(names, best, strict=True)])
-    return bars
+    least = [min((q for _, q, _ in stage), default=0.0) for stage in stages]
+    return [[(name, q - low, chosen) for name, q, chosen in stage] for stage, low in zip(stages, least, strict=True)]
 
 
 def check_moves(name: str, model: RepairModel, location: Tensor, controls: Tensor) -> None:
