@@ -11,7 +11,7 @@ from torchrl_pomdp.report.tables import half_width, interval_text
 
 __all__ = ["iteration_chart"]
 
-_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 640, 300, 84, 16, 16, 58
+_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 480, 280, 82, 12, 14, 62
 
 
 def iteration_chart(costs: Sequence[tuple[str, Estimate]], rejected: Mapping[str, str]) -> str:
@@ -44,7 +44,9 @@ def iteration_chart(costs: Sequence[tuple[str, Estimate]], rejected: Mapping[str
     ]
     points = [(_LEFT + step * (number + 0.5), y(cost.mean)) for number, (_, cost) in enumerate(costs)]
     marks.append(f'<polyline class="line" points="{" ".join(f"{x:.1f},{height:.1f}" for x, height in points)}"/>')
-    for (name, cost), each, (x, height) in zip(costs, half, points, strict=True):
+    # Of iterations the numbers, which leave room for many.
+    labels = [costs[0][0], *(name.rpartition(" ")[2] for name, _ in costs[1:])]
+    for (name, cost), each, (x, height), label in zip(costs, half, points, labels, strict=True):
         top, bottom = y(cost.mean + each), y(cost.mean - each)
         hollow = ' class="hollow"' if name in rejected else ""
         about = f"{name}: {interval_text(cost)}" + (f", not accepted: {rejected[name]}" if name in rejected else "")
@@ -52,13 +54,13 @@ def iteration_chart(costs: Sequence[tuple[str, Estimate]], rejected: Mapping[str
         marks.append(
             f"<g><title>{escape(about)}</title>"
             f'<path class="whisker" d="{whiskers}"/><circle{hollow} cx="{x:.1f}" cy="{height:.1f}" r="6"/></g>'
-            f'<text x="{x:.1f}" y="{_HEIGHT - _BOTTOM + 22}" text-anchor="middle">{escape(name)}</text>'
+            f'<text x="{x:.1f}" y="{_HEIGHT - _BOTTOM + 24}" text-anchor="middle">{escape(label)}</text>'
         )
     middle = (_TOP + _HEIGHT - _BOTTOM) / 2
     return (
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" class="chart" role="img" aria-label="Discounted cost of the base policy and '
         f'of each iteration">{"".join(marks)}'
-        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2}" y="{_HEIGHT - 10}" text-anchor="middle">base policy, then iterations</text>'
+        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2}" y="{_HEIGHT - 10}" text-anchor="middle">base policy, then number of the iteration</text>'
         f'<text transform="translate(14 {middle}) rotate(-90)" text-anchor="middle">discounted cost</text></svg>'
     )
 

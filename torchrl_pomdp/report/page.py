@@ -11,16 +11,12 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-import torch
-
 from torchrl_pomdp.checks import check_instance, check_path
-from torchrl_pomdp.config import EVALUATION_SEED
 from torchrl_pomdp.files import write_bytes
-from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.report.disagreements import Disagreements, disagreements
 from torchrl_pomdp.report.iteration_chart import iteration_chart
-from torchrl_pomdp.report.player import lookahead, played_from, player_data
+from torchrl_pomdp.report.player import lookahead, player_data, side_by_side, starts
 from torchrl_pomdp.report.run_folder import RunFolder, read_run_folder
 from torchrl_pomdp.report.tables import interval_text, is_iteration, ratio_texts
 from torchrl_pomdp.trajectories import has_world
@@ -30,6 +26,9 @@ __all__ = ["write_report"]
 # Start states of the player and of the disagreements, the first of the evaluations; stages of a trajectory at most.
 _PLAYED, _COMPARED, _STAGES = 3, 50, 100
 _MOST_PAIRS = 12
+_TITLES = ("Cost per iteration", "Policies", "Parts", "Where the policies disagree", "Trajectories")
+# What is shown of the losses of a part, and in which form.
+_LOSSES = {"accuracy": ".1%", "regret": ".4g", "relative_error": ".1%"}
 
 
 def write_report(folder: str | PathLike[str], *, problem: Problem | None = None) -> Path:
@@ -72,9 +71,9 @@ def write_report(folder: str | PathLike[str], *, problem: Problem | None = None)
     sections = [_problem(run), _costs(run), _table(run), _parts(run)]
     data = ""
     if run.policy is None:
-        sections.append(_section("Trajectories", _paragraph(run.missing)))
+        sections += [_section(title, _paragraph(run.missing)) for title in _TITLES[3:]]
     else:
-        disagreeing, player, data = _played(run)
+        disagreeing, player, data = _played(run, run.policy.problem)
         sections += [disagreeing, player]
     room = files("torchrl_pomdp.report")
     page = Template(room.joinpath("page.html").read_text("utf-8")).substitute(
@@ -93,7 +92,7 @@ def write_report(folder: str | PathLike[str], *, problem: Problem | None = None)
 def _problem(run: RunFolder) -> str:
     config = run.config
     trained = [result for result in run.results if is_iteration(result.name)]
-    lines = [f"{config['algorithm']} from the base policy {config['base']}; {len(run.iterations)} iterations are finished."]
+    lines = [f"{config['algorithm']} from the base policy {config['base']}; iterations finished: {len(run.iterations)}."]
     if run.policy is not None:
         lines.insert(0, run.policy.problem.model.describe())
         best = next((result for result in run.results if result.name == run.policy.name), None)
@@ -103,8 +102,8 @@ def _problem(run: RunFolder) -> str:
             lines.append(f"{best.name} costs {interval_text(best.comparison.cost)}{against}.")
     numbers = {**config["config"], "states": config.get("states"), "version": config.get("version")}
     rows = [(name, json.dumps(value)) for name, value in numbers.items()]
-    details = f"<details><summary>All numbers of the run</summary>{_rows(('number', 'value'), rows)}</details>"
-    return f"<h1>{escape(str(config['problem']))}</h1>{''.join(map(_paragraph, lines))}{details}"
+    details = f"<details><summary>All numbers of the run</summary>{_rows(('number', 'value'), rows, texts=2)}</details>"
+    return f"<h1>{escape(str(config['problem']))}</h1>{''.join(map(_paragraph, lines))}{details}{_contents()}"
 
 
 def _costs(run: RunFolder) -> str:
@@ -141,7 +140,7 @@ def _table(run: RunFolder) -> str:
 
 def _parts(run: RunFolder) -> str:
     if not run.iterations:
-        return ""
+        return _section("Parts", _paragraph("No iteration is finished yet."))
     names = () if run.policy is None else run.policy.problem.partition.names
     rows = []
     for iteration in run.iterations:
@@ -149,7 +148,7 @@ def _parts(run: RunFolder) -> str:
             kind, _, part = key.rpartition("/")[2].partition("-")[2].partition("-part-")
             name = names[int(part)] if part.isdigit() and int(part) < len(names) else f"part {part}"
             of = {"improve": "policy", "evaluate": "value"}.get(kind, kind)
-            losses = [_number(record["losses"].get(loss)) for loss in ("accuracy", "regret", "relative_error")]
+            losses = [_number(record["losses"].get(loss), form) for loss, form in _LOSSES.items()]
             rows.append((name, str(iteration["number"]), of, str(record["samples"]), *losses))
     head = ("part", "iteration", "network", "labels", "accuracy", "regret", "relative error")
     text = (
@@ -160,33 +159,27 @@ def _parts(run: RunFolder) -> str:
     return _section("Parts", _paragraph(text) + _rows(head, rows))
 
 
-def _number(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, (int, float)) else "–"
+def _number(value: Any, form: str) -> str:
+    return format(value, form) if isinstance(value, (int, float)) else "–"
 
 
 # ---- what is played ----------------------------------------------------------------------------------------------------
 
 
-def _played(run: RunFolder) -> tuple[str, str, str]:
+def _played(run: RunFolder, problem: Problem) -> tuple[str, str, str]:
     """The sections of disagreements and of the player, and the player's data with its script."""
-    assert run.policy is not None
-    problem, trained, name = run.policy.problem, run.policy.policy, run.policy.name
-    base = problem.base_policies.get(run.config["base"], trained)
-    model = problem.model
-    keys = seed_keys(EVALUATION_SEED, torch.arange(_COMPARED, device=model.device))
-    y, noise = model.drawn(problem.start, fold(keys, 0), "start"), fold(keys, 1)
-    stages = min(_STAGES, model.horizon)
-    found = disagreements(problem, base, trained, y, noise, max_steps=stages)
-    factors = lookahead(problem, base)
-    policies = {str(run.config["base"]): base, name: trained}
-    trajectories = [
-        {each: played_from(problem, policy, y[i], noise[i], factors, stages) for each, policy in policies.items()}
-        for i in range(_PLAYED)
-    ]
-    content = player_data(problem, trajectories)
+    base, trained = next(iter(run.policies)), list(run.policies)[-1]
+    stages = min(_STAGES, problem.model.horizon)
+    content = player_data(problem, side_by_side(problem, run.policies, _PLAYED, stages))
     script = files("torchrl_pomdp.report").joinpath("player.js").read_text("utf-8")
     data = f'<script type="application/json" id="player-data">{_json(content)}</script>\n<script>\n{script}</script>'
-    return _disagreements(found, *policies), _player(problem, content, *policies), data
+    if base == trained:
+        differing = _section(_TITLES[3], _paragraph("No policy is trained yet."))
+    else:
+        y, keys = starts(problem, _COMPARED)
+        found = disagreements(problem, run.policies[base], run.policies[trained], y, keys, max_steps=stages)
+        differing = _disagreements(found, base, trained)
+    return differing, _player(problem, content), data
 
 
 def _disagreements(found: Disagreements, base: str, trained: str) -> str:
@@ -197,13 +190,15 @@ def _disagreements(found: Disagreements, base: str, trained: str) -> str:
     text = f"Decisions of {trained} in {_COMPARED} trajectories of its own, beside what {base} would do in the same states."
     shares = _rows(("part", "decisions", "different", "share"), rows)
     pairs = [(one, other, str(count)) for one, other, count in found.pairs[:_MOST_PAIRS]]
-    table = _rows((base, trained, "times"), pairs) if pairs else _paragraph("They agree everywhere.")
-    return _section("Where the policies disagree", f"{_paragraph(text)}{shares}<br>{table}")
+    table = _rows((base, trained, "times"), pairs, texts=2) if pairs else _paragraph("They agree everywhere.")
+    return _section(_TITLES[3], f"{_paragraph(text)}{shares}<br>{table}")
 
 
-def _player(problem: Problem, content: Mapping[str, Any], base: str, trained: str) -> str:
+def _player(problem: Problem, content: Mapping[str, Any]) -> str:
     model = problem.model
-    notes = [f"{base} and {trained} from the same states, under the same noise. Arrow keys step; cost is discounted."]
+    notes = [
+        f"{' and '.join(content['policies'])} from the same states, under the same noise. Arrow keys step; cost is discounted."
+    ]
     if not has_world(model):
         notes.append(f"The truth is not shown: {type(model).__name__} has no hidden states, which its world() would give.")
     if lookahead(problem, problem.base_policies[problem.baseline]) is None:
@@ -231,21 +226,37 @@ def _player(problem: Problem, content: Mapping[str, Any], base: str, trained: st
 
 
 def _section(title: str, content: str) -> str:
-    return f"<section><h2>{escape(title)}</h2>{content}</section>"
+    return f'<section id="{_anchor(title)}"><h2>{escape(title)}</h2>{content}</section>'
+
+
+def _anchor(title: str) -> str:
+    return title.lower().replace(" ", "-")
+
+
+def _contents() -> str:
+    links = [f'<a href="#{_anchor(title)}">{title}</a>' for title in _TITLES]
+    return f"<nav>{''.join(links)}</nav>"
 
 
 def _paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
-def _rows(head: Sequence[str], rows: Iterable[Sequence[str]], marked: Sequence[int] = ()) -> str:
-    """A table; marked rows are bold."""
+def _rows(head: Sequence[str], rows: Iterable[Sequence[str]], marked: Sequence[int] = (), texts: int = 1) -> str:
+    """A table whose first columns are ``texts``, the others numbers; marked rows are bold."""
     cells = [
         f"<tr{' class=best' if number in marked else ''}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>"
         for number, row in enumerate(rows)
     ]
-    top = "".join(f'<th scope="col">{escape(name)}</th>' for name in head)
+    top = _cells("th", head, texts)
     return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{"".join(cells)}</tbody></table></div>'
+
+
+def _cells(tag: str, row: Sequence[str], texts: int) -> str:
+    kind = {"th": ' scope="col"', "td": ""}[tag]
+    return "".join(
+        f"<{tag}{kind}{' class=text' if column < texts else ''}>{escape(cell)}</{tag}>" for column, cell in enumerate(row)
+    )
 
 
 def _json(content: Any) -> str:

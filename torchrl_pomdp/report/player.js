@@ -30,9 +30,9 @@
     const at = places.map(p => [p[0] / unit, p[1] / unit]);
     const [left, right] = [Math.min(...xs) / unit - 0.7, Math.max(...xs) / unit + 0.7];
     const [top, bottom] = [Math.min(...ys) / unit - 0.8, Math.max(...ys) / unit + 0.7];
-    const box = make("div", {}, parent);
+    const box = make("div", right - left > 12 ? { class: "long" } : {}, parent);
     make("div", { class: "soft" }, box, label);
-    const svg = make("svg", { class: right - left > 12 ? "net wide" : "net", role: "img", "aria-label": label,
+    const svg = make("svg", { class: "net", role: "img", "aria-label": label,
       viewBox: `${left} ${top} ${right - left} ${bottom - top}` }, box);
     for (const [a, b] of edges) make("line", { x1: at[a][0], y1: at[a][1], x2: at[b][0], y2: at[b][1] }, svg);
     const nodes = at.map(([x, y], i) => {
@@ -96,10 +96,11 @@
   };
 
   const state = parent => {
-    const { layout } = { layout: data.scene };
+    const layout = data.scene;
     if (layout.kind === "network") {
-      const known = network(parent, "what is known: expected damage", frame => frame.damage, layout);
-      const truth = network(parent, "the truth", frame => frame.truth, layout);
+      const nets = make("div", { class: "nets" }, parent);
+      const known = network(nets, "what is known: expected damage", frame => frame.damage, layout);
+      const truth = network(nets, "the truth", frame => frame.truth, layout);
       return frame => { known(frame); truth(frame); };
     }
     const belief = bars(parent, "what is known");

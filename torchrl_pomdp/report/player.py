@@ -9,12 +9,14 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_pomdp.config import EVALUATION_SEED
 from torchrl_pomdp.envs.scene import MOST_CONTROLS, control_bars
 from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.trajectories import play
 
-__all__ = ["lookahead", "played_from", "player_data"]
+__all__ = ["lookahead", "player_data", "side_by_side", "starts"]
 
 # Bytes of the JSON text, so that a page stays below three million.
 _MOST_BYTES = 2_000_000
@@ -31,14 +33,33 @@ def lookahead(problem: Problem, base: Policy) -> Any:
     return r_nt(problem, base, trajectories=_TRAJECTORIES, terminal_cost=problem.pessimistic_cost)
 
 
-def played_from(
-    problem: Problem, policy: Policy, y: TensorDictBase, key: torch.Tensor, factors: Any, max_steps: int
-) -> TensorDictBase:
-    """One trajectory ``[T]`` of a policy from ``y``, of batch ``()``, with the Q-factors that ``factors`` estimates."""
-    trajectory = play(problem.model, policy, y, key, max_steps=max_steps)
-    if factors is not None:
-        trajectory.set("q_factors", factors.q_factors(trajectory.select(*problem.model.state_keys)))
-    return trajectory
+def starts(problem: Problem, count: int) -> tuple[TensorDictBase, torch.Tensor]:
+    """The first start states ``[count]`` of the evaluations, and keys of the noise."""
+    keys = seed_keys(EVALUATION_SEED, torch.arange(count, device=problem.model.device))
+    return problem.model.drawn(problem.start, fold(keys, 0), "start"), fold(keys, 1)
+
+
+def side_by_side(
+    problem: Problem, policies: Mapping[str, Policy], count: int, max_steps: int
+) -> list[dict[str, TensorDictBase]]:
+    """Trajectories ``[T]`` of policies from the same states under the same noise, with Q-factors of the first policy.
+
+    Args:
+        problem: the problem.
+        policies: the policies by name, the base policy first.
+        count: number of start states.
+        max_steps: the most stages.
+    """
+    y, keys = starts(problem, count)
+    factors = lookahead(problem, next(iter(policies.values())))
+    found: list[dict[str, TensorDictBase]] = []
+    for i in range(count):
+        found.append(
+            {name: play(problem.model, policy, y[i], keys[i], max_steps=max_steps) for name, policy in policies.items()}
+        )
+        for trajectory in found[-1].values() if factors is not None else ():
+            trajectory.set("q_factors", factors.q_factors(trajectory.select(*problem.model.state_keys)))
+    return found
 
 
 def player_data(problem: Problem, trajectories: list[Mapping[str, TensorDictBase]]) -> dict[str, Any]:
@@ -46,13 +67,12 @@ def player_data(problem: Problem, trajectories: list[Mapping[str, TensorDictBase
 
     Args:
         problem: the problem.
-        trajectories: for each start state, trajectories ``[T]`` by policy, see :func:`played_from`.
+        trajectories: for each start state, trajectories ``[T]`` by policy, see :func:`side_by_side`.
 
     Examples:
         >>> from torchrl_pomdp.problems import make_problem
-        >>> problem, key = make_problem("tiger"), torch.tensor(0)
-        >>> trajectory = played_from(problem, problem.base_policies["listen"], problem.start(key), key, None, 2)
-        >>> data = player_data(problem, [{"listen": trajectory}])
+        >>> problem = make_problem("tiger")
+        >>> data = player_data(problem, side_by_side(problem, {"listen": problem.base_policies["listen"]}, 1, 2))
         >>> data["policies"], [frame["does"] for frame in data["starts"][0][0]]
         (['listen'], ['listen', 'listen', 'the end'])
     """

@@ -16,6 +16,8 @@ from torchrl_pomdp.report.effort import check_iterations
 from torchrl_pomdp.report.tables import Result
 
 if TYPE_CHECKING:
+    from tensordict.nn import TensorDictModuleBase
+
     from torchrl_pomdp.problems.problem import Problem
     from torchrl_pomdp.trainers.checkpoint import Checkpoint
 
@@ -41,6 +43,14 @@ class RunFolder:
     policy: Checkpoint | None
     missing: str
 
+    @property
+    def policies(self) -> dict[str, TensorDictModuleBase]:
+        """The base policy and the trained one by name; one alone where nothing is trained yet, none where none can be read."""
+        if self.policy is None:
+            return {}
+        base = str(self.config["base"])
+        return {base: self.policy.problem.base_policies[base], self.policy.name: self.policy.policy}
+
 
 def read_run_folder(folder: Path, problem: Problem | None) -> RunFolder:
     """Read a folder of a run, which may still go on.
@@ -56,6 +66,10 @@ def read_run_folder(folder: Path, problem: Problem | None) -> RunFolder:
     if lacking or not isinstance(config["config"], dict):
         raise DamagedFileError(f"{folder / 'config.json'} is damaged, it is not what a training run writes: restore it")
     policy, missing = _policy(folder, problem)
+    if policy is not None and config["base"] not in policy.problem.base_policies:
+        raise DamagedFileError(
+            f"{folder / 'config.json'} is damaged, its problem has no base policy {config['base']!r}: restore it"
+        )
     return RunFolder(config, _results(folder / "metrics.json"), _iterations(folder / "iterations.json"), policy, missing)
 
 
