@@ -56,13 +56,13 @@ def iteration_chart(costs: Sequence[tuple[str, Estimate]], rejected: Mapping[str
             f'<path class="whisker" d="{whiskers}"/><circle{hollow} cx="{x:.1f}" cy="{height:.1f}" r="6"/></g>'
             f'<text x="{x:.1f}" y="{_HEIGHT - _BOTTOM + 24}" text-anchor="middle">{escape(label)}</text>'
         )
-    middle = (_TOP + _HEIGHT - _BOTTOM) / 2
-    return (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" class="chart" role="img" aria-label="Discounted cost of the base policy and '
-        f'of each iteration">{"".join(marks)}'
-        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2}" y="{_HEIGHT - 10}" text-anchor="middle">base policy, then number of the iteration</text>'
-        f'<text transform="translate(14 {middle}) rotate(-90)" text-anchor="middle">discounted cost</text></svg>'
-    )
+    about = "Discounted cost of the base policy and of each iteration"
+    across, down = (_LEFT + _WIDTH - _RIGHT) / 2, (_TOP + _HEIGHT - _BOTTOM) / 2
+    marks += [
+        f'<text x="{across}" y="{_HEIGHT - 10}" text-anchor="middle">base policy, then number of the iteration</text>',
+        f'<text transform="translate(14 {down}) rotate(-90)" text-anchor="middle">discounted cost</text>',
+    ]
+    return f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" class="chart" role="img" aria-label="{about}">{"".join(marks)}</svg>'
 
 
 def _ticks(low: float, high: float) -> list[float]:

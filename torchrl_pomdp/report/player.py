@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -54,15 +54,15 @@ def side_by_side(
     factors = lookahead(problem, next(iter(policies.values())))
     found: list[dict[str, TensorDictBase]] = []
     for i in range(count):
-        found.append(
-            {name: play(problem.model, policy, y[i], keys[i], max_steps=max_steps) for name, policy in policies.items()}
-        )
-        for trajectory in found[-1].values() if factors is not None else ():
-            trajectory.set("q_factors", factors.q_factors(trajectory.select(*problem.model.state_keys)))
+        found.append({})
+        for name, policy in policies.items():
+            found[-1][name] = trajectory = play(problem.model, policy, y[i], keys[i], max_steps=max_steps)
+            if factors is not None:
+                trajectory.set("q_factors", factors.q_factors(trajectory.select(*problem.model.state_keys)))
     return found
 
 
-def player_data(problem: Problem, trajectories: list[Mapping[str, TensorDictBase]]) -> dict[str, Any]:
+def player_data(problem: Problem, trajectories: Sequence[Mapping[str, TensorDictBase]]) -> dict[str, Any]:
     """What the player shows, as JSON: the layout of the scene and, for each start state and policy, the frames of all stages.
 
     Args:
@@ -78,7 +78,7 @@ def player_data(problem: Problem, trajectories: list[Mapping[str, TensorDictBase
     """
     scene = problem.model.scene()
     starts = [[_frames(problem, trajectory) for trajectory in each.values()] for each in trajectories]
-    data = {"policies": list(trajectories[0]), "scene": scene.layout(), "starts": starts, "cut": None}
+    data: dict[str, Any] = {"policies": list(trajectories[0]), "scene": scene.layout(), "starts": starts, "cut": None}
     size = len(json.dumps(data))
     if size > _MOST_BYTES:
         longest = max(len(frames) for start in starts for frames in start)
@@ -91,7 +91,7 @@ def _frames(problem: Problem, trajectory: TensorDictBase) -> list[dict[str, Any]
     """A frame for every stage, and one for the end."""
     model = problem.model
     core = [*model.state_keys, *(["hidden"] if "hidden" in trajectory else [])]
-    states = torch.cat([trajectory.select(*core), trajectory["next"].select(*core)[-1:]])
+    states: Any = torch.cat([trajectory.select(*core), trajectory["next"].select(*core)[-1:]])
     u = trajectory["action"]
     frames = model.scene().frames(states.set("action", torch.cat([u, u[-1:]])))
     frames[-1] |= {"does": "the end"}

@@ -89,7 +89,7 @@ def _estimates(entry: Any) -> dict[str, Any]:
         if numbers is None and name == "ratio":
             found[name] = None
             continue
-        values = {key: math.nan if value is None else value for key, value in numbers.items()}
+        values: dict[str, Any] = {key: math.nan if value is None else value for key, value in numbers.items()}
         if not all(isinstance(value, (int, float)) for value in values.values()):
             raise TypeError(f"{name} holds what is no number")
         found[name] = Estimate(**values)
