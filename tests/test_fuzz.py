@@ -42,7 +42,7 @@ PUBLIC = (
     *("envs", "envs.repair", "modules", "modules.repair", "problems"),
     *("collectors", "objectives", "trainers", "trainers.run"),
     *("controller", "evaluation", "noise", "report", "reproduce", "files", "checks", "tensor_checks", "identity"),
-    *("planners", "bounds", "changes"),
+    *("planners", "bounds", "changes", "trajectories", "report.page"),
 )
 
 # What is not tried, and why.

@@ -26,6 +26,8 @@ __all__ = ["write_report"]
 # Start states of the player and of the disagreements, the first of the evaluations; stages of a trajectory at most.
 _PLAYED, _COMPARED, _STAGES = 3, 50, 100
 _MOST_PAIRS = 12
+# Attributes of cells and rows.
+_TEXT, _BEST = ' class="text"', ' class="best"'
 _TITLES = ("Cost per iteration", "Policies", "Parts", "Where the policies disagree", "Trajectories")
 # What is shown of the losses of a part, and in which form.
 _LOSSES = {"accuracy": ".1%", "regret": ".4g", "relative_error": ".1%"}
@@ -244,19 +246,14 @@ def _paragraph(text: str) -> str:
 
 def _rows(head: Sequence[str], rows: Iterable[Sequence[str]], marked: Sequence[int] = (), texts: int = 1) -> str:
     """A table whose first columns are ``texts``, the others numbers; marked rows are bold."""
-    cells = [
-        f"<tr{' class=best' if number in marked else ''}>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>"
-        for number, row in enumerate(rows)
-    ]
+    cells = [f"<tr{_BEST if number in marked else ''}>{_cells('td', row, texts)}</tr>" for number, row in enumerate(rows)]
     top = _cells("th", head, texts)
     return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{"".join(cells)}</tbody></table></div>'
 
 
 def _cells(tag: str, row: Sequence[str], texts: int) -> str:
     kind = {"th": ' scope="col"', "td": ""}[tag]
-    return "".join(
-        f"<{tag}{kind}{' class=text' if column < texts else ''}>{escape(cell)}</{tag}>" for column, cell in enumerate(row)
-    )
+    return "".join(f"<{tag}{kind}{_TEXT if column < texts else ''}>{escape(cell)}</{tag}>" for column, cell in enumerate(row))
 
 
 def _json(content: Any) -> str:

@@ -28,6 +28,8 @@ __all__ = ["save_animation"]
 _MOST = 12
 # Of a GIF: dots per inch, and colours of its one palette. Of a film: dots per inch.
 _DPI, _COLOURS, _FILM_DPI = 80, 160, 120
+# Milliseconds that the last frame of a GIF stays longer.
+_PAUSE = 2000
 _BAR = "#9aa5b1"
 
 
@@ -110,7 +112,9 @@ def _gif(figure: Figure, frames: Iterator[None], pace: float) -> bytes:
             palette = image.quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE)
         images.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
     content = io.BytesIO()
-    images[0].save(content, format="GIF", save_all=True, append_images=images[1:], duration=round(1000 / pace), loop=0)
+    # At the end there is time to read it before it begins again.
+    shown = [round(1000 / pace)] * (len(images) - 1) + [round(1000 / pace) + _PAUSE]
+    images[0].save(content, format="GIF", save_all=True, append_images=images[1:], duration=shown, loop=0)
     return content.getvalue()
 
 
@@ -175,13 +179,13 @@ def _draw(model: RepairModel, panels: Mapping[str, Axes], each: Played, stage: i
             level = each.truth[stage].to(each.damage.dtype)
             draw_network(axes, model, level, each.location[stage], controls, f"{each.name}: the truth")
         elif each.bars is not None:
-            _draw_bars(axes, each.bars[stage] if stage < len(each.bars) else [])
+            _draw_bars(axes, each.bars[stage] if stage < len(each.bars) else [], max(map(len, each.bars)))
     # Below what is lowest.
     axes.set_xlabel(each.captions[stage])
 
 
-def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float, bool]]) -> None:
-    """A bar for each control: its Q-factor above the least one."""
+def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float, bool]], room: int) -> None:
+    """A bar for each control, with room for as many as there ever are: its Q-factor above the least one."""
     axes.set_title("Q-factor above the least", fontsize="medium")
     most = max((value for _, value, _ in bars), default=0.0) or 1.0
     for place, (name, value, chosen) in enumerate(bars):
@@ -190,5 +194,5 @@ def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float, bool]]) -> None:
         axes.text(-0.02, place, name, ha="right", va="center", fontsize="small", weight=weight, parse_math=False)
         axes.text(value / most + 0.02, place, f"{value:.4g}", va="center", fontsize="small", weight=weight)
     # Room for the names, the same at every stage.
-    axes.set(xlim=(-0.45, 1.25), ylim=(max(len(bars), 2) - 0.4, -0.6), xticks=[], yticks=[])
+    axes.set(xlim=(-0.45, 1.25), ylim=(room - 0.4, -0.6), xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
