@@ -154,7 +154,7 @@ def test_a_problem_of_ones_own_code_is_given(tmp_path):
     assert "build it and give it as problem=" in unescape(text)
     assert "player-data" not in text
     text = write_report(folder, problem=problem).read_text()
-    assert data_of(text)["scene"] == {"kind": "bars", "bars": ["belief 0", "belief 1"]}
+    assert data_of(text)["scene"] == {"kind": "bars", "bars": ["belief 0", "belief 1"], "more": 0}
     with pytest.raises(ValueError, match="problem must be machine"):
         write_report(folder, problem=make_problem("tiger"))
 

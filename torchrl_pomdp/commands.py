@@ -68,12 +68,20 @@ def train(command: Train) -> None:
     if isinstance(problem.model, RepairModel):
         figures[out / "trajectory.png"] = partial(_trajectory_figure, problem, problem.model, best.policy)
     print(draw(figures))
-    print(f"report: {write_report(out, problem=problem)}")
+    print(_write_report(out, problem))
     if best.iteration == 0:
         print(
             f"no iteration was accepted: best.pt is the base policy, {best.name}. What usually helps: more --samples-per-part, "
             "more --validation-states, more --trajectories"
         )
+
+
+def _write_report(out: Path, problem: Problem) -> str:
+    """Write the page about a run; a line that says where it is, or why there is none: results are not lost for want of it."""
+    try:
+        return f"report: {write_report(out, problem=problem)}"
+    except Exception as error:  # whatever a world or a name of the user's own code may raise when it is shown
+        return f"no report: {' '.join(str(error).split()) or type(error).__name__}"
 
 
 def _workers(command: Train) -> AbstractContextManager[Workers]:

@@ -37,7 +37,7 @@ class Scene:
         >>> problem, key = make_problem("tiger"), torch.tensor(1)
         >>> scene = problem.model.scene()
         >>> scene.layout()
-        {'kind': 'bars', 'bars': ['belief 0', 'belief 1']}
+        {'kind': 'bars', 'bars': ['belief 0', 'belief 1'], 'more': 0}
         >>> scene.frames(play(problem.model, problem.base_policies["listen"], problem.start(key), key, max_steps=1))
         [{'does': 'listen', 'bars': [0.5, 0.5], 'text': '', 'truth': 'state 1'}]
     """
@@ -48,11 +48,11 @@ class Scene:
         self._bars = [key for key in model.state_keys if spec[key].dtype.is_floating_point]
 
     def layout(self) -> dict[str, Any]:
-        """What stays the same, as JSON: the names of the bars."""
+        """What stays the same, as JSON: the names of the bars, and how many are left out."""
         spec, names = self.model.state_spec(), []
         for key in self._bars:
             names += [" ".join([key, ",".join(map(str, place))]) for place in product(*map(range, spec[key].shape))]
-        return {"kind": "bars", "bars": names[:_MOST_BARS]}
+        return {"kind": "bars", "bars": names[:_MOST_BARS], "more": max(0, len(names) - _MOST_BARS)}
 
     def frames(self, trajectory: TensorDictBase) -> list[dict[str, Any]]:
         """What changes, as JSON: one frame for each stage.

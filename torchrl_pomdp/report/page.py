@@ -16,7 +16,7 @@ from torchrl_pomdp.files import write_bytes
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.report.disagreements import Disagreements, disagreements
 from torchrl_pomdp.report.iteration_chart import iteration_chart
-from torchrl_pomdp.report.player import lookahead, player_data, side_by_side, starts
+from torchrl_pomdp.report.player import player_data, side_by_side, starts
 from torchrl_pomdp.report.run_folder import RunFolder, read_run_folder
 from torchrl_pomdp.report.tables import interval_text, is_iteration, ratio_texts
 from torchrl_pomdp.trajectories import has_world
@@ -94,7 +94,8 @@ def write_report(folder: str | PathLike[str], *, problem: Problem | None = None)
 def _problem(run: RunFolder) -> str:
     config = run.config
     trained = [result for result in run.results if is_iteration(result.name)]
-    lines = [f"{config['algorithm']} from the base policy {config['base']}; iterations finished: {len(run.iterations)}."]
+    finished = f"{len(run.iterations)} of {config['config'].get('iterations', '?')}"
+    lines = [f"{config['algorithm']} from the base policy {config['base']}; iterations finished: {finished}."]
     if run.policy is not None:
         lines.insert(0, run.policy.problem.model.describe())
         best = next((result for result in run.results if result.name == run.policy.name), None)
@@ -203,10 +204,13 @@ def _player(problem: Problem, content: Mapping[str, Any]) -> str:
     ]
     if not has_world(model):
         notes.append(f"The truth is not shown: {type(model).__name__} has no hidden states, which its world() would give.")
-    if lookahead(problem, problem.base_policies[problem.baseline]) is None:
+    if not content["starts"][0][0][0]["q"]:
         notes.append("Q-factors are not shown, as there are too many controls.")
     if content["cut"] is not None:
         notes.append(f"Only the first {content['cut']} stages are shown, so that the page stays small.")
+    if content["scene"].get("more"):
+        shown = len(content["scene"]["bars"])
+        notes.append(f"Only the first {shown} of {shown + content['scene']['more']} numbers of the belief are shown.")
     legend = ""
     if content["scene"]["kind"] == "network":
         colours = "rgb(255 255 204), rgb(254 217 118), rgb(253 141 60), rgb(227 26 28), rgb(128 0 38)"

@@ -26,6 +26,7 @@ _TRAJECTORIES = 10
 
 def lookahead(problem: Problem, base: Policy) -> Any:
     """What estimates Q-factors of the base policy; None where controls are too many for bars."""
+    # Not at the top: the trainers know the reports of peers.
     from torchrl_pomdp.trainers.recipes import r_nt
 
     if not problem.model.enumerable or problem.model.num_controls > MOST_CONTROLS:

@@ -114,7 +114,7 @@ def _iterations(path: Path) -> list[Mapping[str, Any]]:
 
 def _policy(folder: Path, problem: Problem | None) -> tuple[Checkpoint | None, str]:
     """The policy to show, and why there is none."""
-    # Not at the top: the trainers make reports.
+    # Not at the top: the trainers know the reports of peers.
     from torchrl_pomdp.trainers.checkpoint import load_checkpoint
 
     numbered = {path: re.fullmatch(r"iteration-(\d+)\.pt", path.name) for path in folder.glob("iteration-*.pt")}
