@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from _hostile import (
     Hostile,
@@ -21,6 +23,7 @@ from _hostile import (
     seeds,
     sequences,
     sizes,
+    states,
     tensors,
     terminal_costs,
     texts,
@@ -44,6 +47,7 @@ from _valid import (
     env,
     greedy,
     model,
+    problem,
     quick_reproduce,
     repair_model,
     some_workers,
@@ -51,9 +55,10 @@ from _valid import (
     written,
 )
 
-from torchrl_pomdp import checks, evaluation, files, noise, report, reproduce, tensor_checks
+from torchrl_pomdp import checks, evaluation, files, noise, report, reproduce, tensor_checks, trajectories
 from torchrl_pomdp.envs import repair
 from torchrl_pomdp.modules import ZeroCost
+from torchrl_pomdp.report import page
 
 __all__ = ["FILES", "REPORTS"]
 
@@ -64,6 +69,14 @@ TITLES = values(None, 3, b"x", [], object())
 RUNS = [*mappings(), *values({"run": None}, {"run": 3}, {"run": [3]}, {"run": [{}]})]
 PLAYED = env().rollout(2, greedy())[0]
 NO_TENSORS = values(object(), {"x": object()}, len, int)
+
+
+def run_folder(folder: Path) -> Path:
+    """A run that has just begun."""
+    content = {"problem": "line3", "algorithm": "API", "base": "greedy", "config": {"seed": 0}}
+    files.write_json(folder / "run" / "config.json", content)
+    return folder / "run"
+
 
 REPORTS = {
     "evaluation.discounted_costs": lambda _: case(
@@ -129,15 +142,31 @@ REPORTS = {
     ),
     "envs.repair.save_animation": lambda folder: case(
         repair.save_animation,
-        path=(folder / "a.gif", [*paths(), *values("a", "a.png")]),
+        path=(folder / "a.gif", [*paths(), *values("a", "a.png", "a.mp3")]),
         model=repair_model(),
         trajectories=({"greedy": PLAYED}, [
             *mappings(),
             *values({}, {3: PLAYED}, {"": PLAYED}, {"greedy": {}}, {"greedy": PLAYED[0]}, {"greedy": PLAYED[:0]}),
             *(Hostile(wrong.label, {"greedy": wrong.value}) for wrong in no_states(PLAYED, "belief", "location", "action")),
             *(Hostile(wrong.label, {"greedy": wrong.value}) for wrong in [*wrong_entries(PLAYED), *wrong_actions(PLAYED)]),
+            *values(*({"greedy": PLAYED.copy().set("q_factors", wrong)} for wrong in (torch.zeros(2, 9), torch.zeros(3)[:2]))),
+            *values({"greedy": PLAYED.copy().set("hidden", PLAYED.select("location"))}),
         ]),
         frames_per_second=(2.0, numbers("[0.1, 50]")),
+    ),
+    "trajectories.has_world": lambda _: case(trajectories.has_world, model=belief_model()),
+    "trajectories.play": lambda _: case(
+        trajectories.play,
+        model=belief_model(),
+        policy=a_policy(),
+        y=(state(), states(state())),
+        keys=(KEYS, [*keys(), Hostile("one key for two states", KEYS[:1])]),
+        max_steps=(2, integers(1)),
+    ),
+    "report.page.write_report": lambda folder: case(
+        page.write_report,
+        folder=(run_folder(folder), [*paths(), *values("no such folder")]),
+        problem=at_once((problem(), objects())),
     ),
     "report.interval_text": lambda _: case(report.interval_text, value=(comparison().cost, objects(comparison()))),
     "report.ratio_texts": lambda _: case(

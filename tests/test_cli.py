@@ -51,6 +51,8 @@ def test_train_evaluate_and_resume(tmp_path, capsys, algorithm):
     assert "validation states" in iteration["reason"]
     for name in ("costs.png", "trajectory.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
+    assert f"report: {out / 'report.html'}" in text.splitlines()
+    assert "player-data" in (out / "report.html").read_text()
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
     assert main(["evaluate", str(out / "iteration-1.pt"), "--states", "20"]) == 0
     expected = metrics[f"{algorithm} 1"]["ratio"]["mean"]
@@ -206,6 +208,15 @@ def test_a_failed_picture_does_not_lose_the_table(tmp_path, monkeypatch, capsys)
     assert main(["train", "line3", "--algorithm", "API", *TINY.split(), "--out", str(tmp_path / "run")]) == 0
     text = capsys.readouterr().out
     assert text.index("| API 1 |") < text.index("no pictures: no font")
+
+
+def test_a_failed_report_does_not_lose_the_results(tmp_path, monkeypatch, capsys):
+    def fail(*args, **options):
+        raise RuntimeError("no\nworld")
+
+    monkeypatch.setattr(commands, "write_report", fail)
+    assert main(["train", "line3", "--algorithm", "API", *TINY.split(), "--out", str(tmp_path / "run")]) == 0
+    assert "no report: no world" in capsys.readouterr().out.splitlines()
 
 
 def test_a_run_without_an_accepted_iteration_says_so_and_what_helps(tmp_path, capsys):

@@ -43,7 +43,7 @@ PUBLIC = (
     *("envs", "envs.repair", "modules", "modules.repair", "problems"),
     *("collectors", "objectives", "trainers", "trainers.run"),
     *("controller", "evaluation", "noise", "report", "reproduce", "files", "checks", "tensor_checks", "identity"),
-    *("planners", "bounds", "changes", "envs.gym", "problems.gym"),
+    *("planners", "bounds", "changes", "envs.gym", "problems.gym", "trajectories", "report.page"),
 )
 
 # What is not tried, and why.

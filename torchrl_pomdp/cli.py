@@ -1,4 +1,5 @@
-"""The command ``torchrl-pomdp``: train, evaluate and compare policies, reproduce the paper's experiments, list the problems.
+"""The command ``torchrl-pomdp``: train, evaluate, compare and show policies, reproduce the paper's experiments, list the
+problems.
 
 Nothing that takes long to import is imported before the arguments are read.
 """
@@ -173,6 +174,26 @@ class Changes:
 
 
 @dataclass(frozen=True)
+class Report:
+    """Write one page about a training run, report.html in its folder: costs, parts, where policies disagree, and a player of
+    trajectories.
+    """
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run, which may be unfinished."""
+
+    problem: str | None = None
+    """Problem, as for the command train; a run knows its own unless it is of one's own code."""
+
+    animation: Path | None = None
+    """Also write the trajectories of the base policy and the trained one, side by side, to this file .gif, or .mp4 where ffmpeg
+    is installed; of repair problems."""
+
+    stages: int = 100
+    """The most stages of the animation."""
+
+
+@dataclass(frozen=True)
 class Problems:
     """List the known problems with their numbers of states, controls and observations."""
 
@@ -190,6 +211,7 @@ def main(args: list[str] | None = None) -> int:
         | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[Changes, tyro.conf.subcommand("changes")]
         | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
+        | Annotated[Report, tyro.conf.subcommand("report")]
         | Annotated[Problems, tyro.conf.subcommand("problems")]
     )
     about = (
@@ -197,7 +219,7 @@ def main(args: list[str] | None = None) -> int:
         "`torchrl-pomdp COMMAND --help` lists the options of a command; "
         "`--tyro-print-completion bash` (or zsh, tcsh) prints the completion for a shell."
     )
-    command: Train | Evaluate | Compare | Changes | Reproduce | Problems = tyro.cli(
+    command: Train | Evaluate | Compare | Changes | Reproduce | Report | Problems = tyro.cli(
         choices, prog="torchrl-pomdp", description=about, args=args
     )
     from torchrl import logger
@@ -217,6 +239,8 @@ def main(args: list[str] | None = None) -> int:
             commands.changes(command)
         elif isinstance(command, Reproduce):
             commands.reproduce(command)
+        elif isinstance(command, Report):
+            commands.report(command)
         else:
             commands.problems()
     except (ValueError, TypeError, OSError, ImportError) as error:

@@ -16,16 +16,20 @@ from torchrl_pomdp.changes import measure_changes
 from torchrl_pomdp.checks import check_integer, check_seed
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
 from torchrl_pomdp.envs import BeliefEnv
-from torchrl_pomdp.envs.repair import RepairModel, trajectory_figure
+from torchrl_pomdp.envs.repair import RepairModel, save_animation, trajectory_figure
 from torchrl_pomdp.evaluation import Comparison, discounted_costs
 from torchrl_pomdp.evaluation import compare as compare_costs
 from torchrl_pomdp.files import check_folder, read_text, write_bytes, write_json
 from torchrl_pomdp.modules import Policy
+from torchrl_pomdp.modules.rollout import MAX_STEPS
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems import PRESETS, Problem, make_problem
 from torchrl_pomdp.problems.find import find_problem
 from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, peer_figure, peer_table, ratio_texts, table
+from torchrl_pomdp.report.page import write_report
+from torchrl_pomdp.report.player import side_by_side
+from torchrl_pomdp.report.run_folder import read_run_folder
 from torchrl_pomdp.reproduce import EXPERIMENTS
 from torchrl_pomdp.reproduce import reproduce as reproduce_experiment
 from torchrl_pomdp.tensor_checks import check_device
@@ -36,9 +40,9 @@ from torchrl_pomdp.workers import LOCAL, Workers
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from torchrl_pomdp.cli import Changes, Compare, Evaluate, Reproduce, Train
+    from torchrl_pomdp.cli import Changes, Compare, Evaluate, Report, Reproduce, Train
 
-__all__ = ["changes", "compare", "evaluate", "problems", "reproduce", "train"]
+__all__ = ["changes", "compare", "evaluate", "problems", "report", "reproduce", "train"]
 
 
 def train(command: Train) -> None:
@@ -64,6 +68,7 @@ def train(command: Train) -> None:
     if isinstance(problem.model, RepairModel):
         figures[out / "trajectory.png"] = partial(_trajectory_figure, problem, problem.model, best.policy)
     print(draw(figures))
+    print(_write_report(out, problem))
     if best.iteration == 0:
         print(
             f"no iteration was accepted: best.pt is the base policy, {best.name}. What usually helps: more --samples-per-part, "
@@ -74,6 +79,14 @@ def train(command: Train) -> None:
             f"best policy: {best.name}, {out / 'best.pt'}. Compare it, or improve it online: torchrl-pomdp evaluate "
             f"{out / 'best.pt'} --online. On a robot: torchrl_pomdp.controller.Controller.from_checkpoint"
         )
+
+
+def _write_report(out: Path, problem: Problem) -> str:
+    """Write the page about a run; a line that says where it is, or why there is none: results are not lost for want of it."""
+    try:
+        return f"report: {write_report(out, problem=problem)}"
+    except Exception as error:  # whatever a world or a name of the user's own code may raise when it is shown
+        return f"no report: {' '.join(str(error).split()) or type(error).__name__}"
 
 
 def _workers(command: Train) -> AbstractContextManager[Workers]:
@@ -216,6 +229,27 @@ def reproduce(command: Reproduce) -> None:
         tell=lambda text: print(f"\n{text}", flush=True),
         progress=True,
     )
+
+
+def report(command: Report) -> None:
+    """Write the page about a run and, if asked for, an animation of its policies; say where they are."""
+    stages = check_integer("stages", command.stages, 1, MAX_STEPS)
+    given = None if command.problem is None else find_problem(command.problem, torch.device("cpu"))
+    if command.animation is None:
+        print(f"report: {write_report(command.run, problem=given)}")
+        return
+    if command.animation.suffix.lower() not in (".gif", ".mp4"):
+        raise ValueError(f"animation must end in .gif or .mp4, got {str(command.animation)!r}")
+    run = read_run_folder(command.run, given)
+    if run.policy is None:
+        raise ValueError(f"animation needs a policy of the run. {run.missing}")
+    problem = run.policy.problem
+    if not isinstance(problem.model, RepairModel):
+        raise ValueError(f"animation is of repair problems, got {problem.name}")
+    print(f"report: {write_report(command.run, problem=given)}")
+    (trajectories,) = side_by_side(problem, run.policies, 1, stages)
+    save_animation(command.animation, problem.model, trajectories)
+    print(f"animation: {command.animation}")
 
 
 def problems() -> None:

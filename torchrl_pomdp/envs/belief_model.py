@@ -23,6 +23,7 @@ from torchrl_pomdp.envs.entries import check_state_entries
 from torchrl_pomdp.envs.names import name_of, number_of
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.rows import inverse_cdf
+from torchrl_pomdp.envs.scene import Scene
 from torchrl_pomdp.noise import fingerprint
 from torchrl_pomdp.tensor_checks import check_keys
 
@@ -337,6 +338,10 @@ class BeliefModel(JointControls, ABC):
     def figure(self, y: TensorDictBase, title: str = "") -> Figure:
         """A picture of a feature state, of batch ``()``; most models have none and raise a ``TypeError``."""
         raise TypeError(f"model has no picture: {type(self).__name__} must override figure()")
+
+    def scene(self) -> Scene:
+        """How feature states are drawn in reports: bars of the core entries, unless a model has a better picture."""
+        return Scene(self)
 
     # ---- what a real robot does and reports, see torchrl_pomdp.controller ---------------------------------------------
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+import subprocess
+
 import pytest
 import torch
 from matplotlib.collections import EllipseCollection, LineCollection, PathCollection
@@ -17,9 +21,12 @@ from torchrl_pomdp.envs.repair import (
     grid,
     line,
     network_figure,
-    rendering,
     save_animation,
 )
+from torchrl_pomdp.envs.repair.rendering import animation, network
+from torchrl_pomdp.modules import RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
+from torchrl_pomdp.trajectories import play
 
 CHAIN, COSTS = damage_chain((0.0, 0.1, 0.2, 0.3)), (0.0, 0.1, 1.0, 10.0, 100.0)
 
@@ -200,21 +207,101 @@ def test_frames_show_stages_costs_and_controls(monkeypatch):
     model = robots(grid(3, 3), num_robots=2)
     trajectories = {"base": played(model, 2), "rollout": played(model, 4, seed=1)}
     drawn = []
-    draw = rendering._draw_network
-    monkeypatch.setattr(rendering, "_draw_network", lambda *given: (drawn.append(given[2:]), draw(*given)))
-    frames = list(rendering._frames(model, [rendering._played(model, *each) for each in trajectories.items()]))
-    assert len(frames) == 5
+    draw = animation.draw_network
+    monkeypatch.setattr(animation, "draw_network", lambda *given: (drawn.append((*given[2:], given[0])), draw(*given)))
+    shown = [animation.played(model, *each) for each in trajectories.items()]
+    panels = animation._panels(model, shown)[1]
+    captions = [[each["belief"].get_xlabel() for each in panels] for _ in animation._frames(model, panels, shown)]
+    assert len(captions) == 5
     for number, (name, trajectory) in enumerate(trajectories.items()):
         discounted = -trajectory["next", "reward"].squeeze(-1) * 0.9 ** torch.arange(len(trajectory))
-        for frame, (damage, location, controls, title) in enumerate(drawn[number::2]):
+        for frame, (damage, location, controls, title, _) in enumerate(drawn[number::2]):
             stage = min(frame, len(trajectory))
             y = trajectory[stage] if stage < len(trajectory) else trajectory[-1]["next"]
             assert torch.equal(location, y["location"])
             assert torch.allclose(damage, y["belief"] @ torch.arange(5.0))
             assert (controls is None) == (stage == len(trajectory))
             assert controls is None or torch.equal(controls, model.split_controls(y["action"]))
-            assert title.startswith(f"{name}\nstage {stage}, cost so far ")
-            assert float(title.split()[-1]) == pytest.approx(float(discounted[:stage].sum()), rel=1e-3)
+            assert title == name
+            caption = captions[frame][number]
+            assert caption.startswith(f"stage {stage}, cost so far ")
+            assert float(caption.split()[-1]) == pytest.approx(float(discounted[:stage].sum()), rel=1e-3)
+
+
+def test_the_truth_is_beside_what_is_known_and_bars_are_q_factors():
+    model = robots(grid(3, 3))
+    policy = RolloutPolicy(model, GreedyRepair(model), trajectories=3, max_steps=5, terminal_cost=NeverRepairCost(model))
+    one = play(model, policy, state(model, 4), torch.tensor(7), max_steps=3)
+    (each,) = shown = [animation.played(model, "rollout", one)]
+    figure, panels = animation._panels(model, shown)
+    assert list(panels[0]) == ["belief", "truth", "bars"]
+    assert len({axes.get_position().y0 for axes in figure.axes[:3]}) == 1, "of a single trajectory beside each other"
+    for stage, _ in enumerate(animation._frames(model, panels, shown)):
+        known, truth, bars = panels[0].values()
+        after = one[stage] if stage < 3 else one[-1]["next"]
+        assert discs(truth)[0].get_array().tolist() == after["hidden", "level"].tolist()
+        assert torch.equal(after["hidden", "location"], after["location"])
+        here = int(after["location"])
+        assert discs(known)[0].get_array()[here] == discs(truth)[0].get_array()[here] or stage == 0, "robots see where they are"
+        assert [known.get_xlabel(), truth.get_xlabel()] == ["", ""]
+        assert bars.get_xlabel() == each.captions[stage]
+        if stage == 3:
+            assert not bars.patches
+            continue
+        q = one["q_factors"][stage]
+        legal = q.isfinite().nonzero().flatten().tolist()
+        names, values = texts(bars)[::2], [float(text) for text in texts(bars)[1::2]]
+        assert names == [model.graph.control_names[u] for u in legal]
+        assert values == pytest.approx((q[legal] - q[legal].min()).tolist(), rel=1e-3)
+        bold = [text.get_text() for text in bars.texts if text.get_weight() == "bold"]
+        assert bold[0] == model.graph.control_names[int(one["action"][stage])]
+        assert [bar.get_width() for bar in bars.patches] == pytest.approx([value / max(values) for value in values], rel=1e-3)
+
+
+def test_several_trajectories_have_the_truth_below(tmp_path):
+    model = robots(grid(3, 3))
+    greedy = play(model, GreedyRepair(model), state(model, 4), torch.tensor(7), max_steps=2)
+    shown = [animation.played(model, "with", greedy), animation.played(model, "without", greedy.exclude("hidden"))]
+    figure, panels = animation._panels(model, shown)
+    figure.draw_without_rendering()
+    first, second = ({kind: axes.get_position() for kind, axes in each.items()} for each in panels)
+    assert list(first) == ["belief", "truth"]
+    assert list(second) == ["belief"]
+    assert first["truth"].y1 < first["belief"].y0
+    assert first["belief"].x1 < second["belief"].x0
+    wrong = greedy.clone()
+    wrong["hidden", "level"][0, 0] = 5
+    with pytest.raises(ValueError, match=r"entry 'level' of hidden of trajectories\['a'\] holds values outside its bounds"):
+        save_animation(tmp_path / "a.gif", model, {"a": wrong})
+    with pytest.raises(ValueError, match=r"q_factors of trajectories\['a'\] must have shape \(2, 5\), got \(2, 4\)"):
+        save_animation(tmp_path / "a.gif", model, {"a": greedy.clone().set("q_factors", torch.zeros(2, 4))})
+
+
+def test_bars_are_for_few_controls():
+    model = robots(grid(3, 3), num_robots=3)
+    one = play(model, GreedyRepair(model), state(model, 4, 4, 4), torch.tensor(7), max_steps=2)
+    assert animation.played(model, "a", one.set("q_factors", torch.zeros(2, 125))).bars is None
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="the program ffmpeg, which writes MP4, is not installed")
+def test_a_film_has_the_frames_of_an_animation(tmp_path):
+    model = robots(grid(3, 3))
+    save_animation(tmp_path / "a.mp4", model, {"a": played(model, 4)}, frames_per_second=2.5)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.mp4"]
+    asked = "stream=codec_name,pix_fmt,r_frame_rate,nb_frames,width,height"
+    command = ["ffprobe", "-v", "error", "-show_entries", asked, "-of", "json", str(tmp_path / "a.mp4")]
+    (stream,) = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)["streams"]
+    assert (stream["codec_name"], stream["pix_fmt"]) == ("h264", "yuv420p")
+    assert (stream["r_frame_rate"], stream["nb_frames"]) == ("5/2", "5")
+    assert stream["width"] % 2 == stream["height"] % 2 == 0
+
+
+def test_a_film_without_ffmpeg_is_refused(tmp_path, monkeypatch):
+    model = robots(line(3))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ValueError, match=r"path ends in \.mp4, which needs the program ffmpeg: install it, or name a \.gif"):
+        save_animation(tmp_path / "a.mp4", model, {"a": played(model, 2)})
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_trajectory_without_its_last_state_ends_at_its_last_control(tmp_path):
@@ -258,7 +345,7 @@ def test_refuses_what_is_no_trajectory_of_the_model(tmp_path):
     for message, trajectories in wrong.items():
         with pytest.raises(ValueError, match=message):
             save_animation(tmp_path / "a.gif", model, trajectories)
-    with pytest.raises(ValueError, match=r"path must end in \.gif, got "):
+    with pytest.raises(ValueError, match=r"path must end in \.gif or \.mp4, got "):
         save_animation(tmp_path / "a.png", model, {"a": good})
     assert not list(tmp_path.iterdir())
 
@@ -275,7 +362,7 @@ def test_what_fails_leaves_nothing_behind(tmp_path, monkeypatch):
         if frame > 2:
             raise RuntimeError("no more")
 
-    monkeypatch.setattr(rendering, "_draw_robots", fail_later)
+    monkeypatch.setattr(network, "_draw_robots", fail_later)
     with pytest.raises(RuntimeError, match="no more"):
         save_animation(path, model, {"a": played(model, 4)})
     assert [each.name for each in tmp_path.iterdir()] == ["a.gif"]

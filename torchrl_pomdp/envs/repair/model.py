@@ -37,6 +37,7 @@ from torchrl_pomdp.envs.repair.graphs import Graph
 from torchrl_pomdp.envs.repair.partition import RepairPartition
 from torchrl_pomdp.envs.repair.robots import Robots
 from torchrl_pomdp.envs.rows import inverse_cdf
+from torchrl_pomdp.envs.scene import Scene
 from torchrl_pomdp.envs.sums import multiply_first, sum_first
 from torchrl_pomdp.envs.world import World
 from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype
@@ -325,6 +326,13 @@ class RepairModel(Robots):
         from torchrl_pomdp.envs.repair.world import RepairWorld
 
         return RepairWorld(self)
+
+    def scene(self) -> Scene:
+        """The network with the robots on it."""
+        # Not at the top: the scene knows the model.
+        from torchrl_pomdp.envs.repair.scene import NetworkScene
+
+        return NetworkScene(self)
 
     # ---- kernels on planes [L, K, N] and locations [R, N] ----------------------------------------------------------
 
