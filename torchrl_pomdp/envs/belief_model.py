@@ -28,8 +28,6 @@ from torchrl_pomdp.noise import fingerprint
 from torchrl_pomdp.tensor_checks import check_keys
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from torchrl_pomdp.envs.world import World
 
 __all__ = ["INSIGNIFICANT", "BeliefModel", "StateGenerator", "generated"]
@@ -335,12 +333,8 @@ class BeliefModel(JointControls, ABC):
         """
         raise TypeError(f"model has no hidden states: {type(self).__name__} must override world(), giving a World")
 
-    def figure(self, y: TensorDictBase, title: str = "") -> Figure:
-        """A picture of a feature state, of batch ``()``; most models have none and raise a ``TypeError``."""
-        raise TypeError(f"model has no picture: {type(self).__name__} must override figure()")
-
     def scene(self) -> Scene:
-        """How feature states are drawn in reports: bars of the core entries, unless a model has a better picture."""
+        """How feature states are drawn: bars of the core entries, unless a model has a better picture."""
         return Scene(self)
 
     # ---- what a real robot does and reports, see torchrl_pomdp.controller ---------------------------------------------

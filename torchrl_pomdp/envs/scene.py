@@ -10,6 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from torchrl_pomdp.envs.belief_model import BeliefModel
 
 __all__ = ["MOST_CONTROLS", "Scene", "control_bars", "rounded"]
@@ -69,6 +71,10 @@ class Scene:
             {"does": doing, "bars": numbers, "text": text, "truth": truth}
             for doing, numbers, text, truth in zip(does, bars, texts, truths, strict=True)
         ]
+
+    def figure(self, y: TensorDictBase, title: str = "") -> Figure:
+        """A picture of a feature state, of batch ``()``; most models have none and raise a ``TypeError``."""
+        raise TypeError(f"model has no picture: {type(self.model).__name__} must give a scene that overrides figure()")
 
 
 def rounded(numbers: Tensor) -> list[Any]:

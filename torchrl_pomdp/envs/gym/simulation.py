@@ -14,6 +14,7 @@ from torchrl_pomdp.checks import check_callable, check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.digits import digits
 from torchrl_pomdp.envs.gym.spaces import count_space, entries_space, entry_array
+from torchrl_pomdp.envs.scene import Scene
 from torchrl_pomdp.envs.world import World
 from torchrl_pomdp.noise import fold, uniform
 
@@ -98,7 +99,7 @@ class BeliefSimulation(Simulation):
     def __init__(self, model: BeliefModel, generator: StateGenerator) -> None:
         super().__init__(model, generator)
         self.observation_space = entries_space(model.state_spec())
-        self.has_figure = type(model).figure is not BeliefModel.figure
+        self.has_figure = type(model.scene()).figure is not Scene.figure
 
     def start(self, keys: Tensor) -> TensorDictBase:
         """Feature states of the generator, with their masks."""
@@ -128,7 +129,7 @@ class BeliefSimulation(Simulation):
 
     def figure(self, state: TensorDictBase, title: str) -> Figure:
         """The belief, as the model draws it."""
-        return self.model.figure(state, title)
+        return self.model.scene().figure(state, title)
 
 
 class WorldSimulation(Simulation):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from numbers import Integral
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,11 +15,6 @@ from torchrl_pomdp.checks import check_integer, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.names import number_of
 from torchrl_pomdp.envs.repair.graphs import Graph
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from torchrl_pomdp.envs.repair.model import RepairModel
 
 __all__ = ["Robots"]
 
@@ -52,12 +47,6 @@ class Robots(BeliefModel):
     def observation_digits(self) -> tuple[int, int]:
         """K and R: each robot sees a level."""
         return self.num_levels, self.num_robots
-
-    def figure(self, y: TensorDictBase, title: str = "") -> Figure:
-        """The feature state on the graph, see :func:`~torchrl_pomdp.envs.repair.network_figure`."""
-        from torchrl_pomdp.envs.repair.rendering import network_figure
-
-        return network_figure(cast("RepairModel", self), y, title=title)
 
     # ---- what real robots do and report --------------------------------------------------------------------------------
 

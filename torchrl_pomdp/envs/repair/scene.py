@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
 
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.scene import Scene, rounded
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["NetworkScene"]
 
@@ -59,6 +62,12 @@ class NetworkScene(Scene):
                 rounded(trajectory["belief"] @ levels), truth, location.tolist(), to, strict=True
             )
         ]
+
+    def figure(self, y: TensorDictBase, title: str = "") -> Figure:
+        """The feature state on the graph, see :func:`~torchrl_pomdp.envs.repair.network_figure`."""
+        from torchrl_pomdp.envs.repair.rendering import network_figure
+
+        return network_figure(self.model, y, title=title)
 
     def _does(self, robots: list[int], to: list[int]) -> str:
         names = self.model.graph.location_names

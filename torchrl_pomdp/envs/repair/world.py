@@ -92,7 +92,7 @@ class RepairWorld(World):
         """The true levels on the graph, drawn as the model draws a belief that knows them."""
         belief = torch.nn.functional.one_hot(hidden.get("level"), self.model.num_levels).to(self.model.dtype)
         known = {"belief": belief, "location": hidden.get("location")}
-        return self.model.figure(TensorDict(known, batch_size=hidden.batch_size, device=self.model.device), title)
+        return self.model.scene().figure(TensorDict(known, batch_size=hidden.batch_size, device=self.model.device), title)
 
     def _of_level(self, table: Tensor, level: Tensor) -> Tensor:
         """Entries of costs or chain for levels ``[*B, L]``."""
