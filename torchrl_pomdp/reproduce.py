@@ -253,8 +253,7 @@ def reproduce(
         problems: only these problems; none: all of the experiment's.
         seed: seed of the training.
         runs: folder of the run folders.
-        out: folder of the results; ``NAME.json``, ``NAME.md`` and ``NAME-*.png`` go to the folder in it that is called as the
-            experiment.
+        out: folder of the results: ``EXPERIMENT/NAME.json``, ``NAME.md`` and ``NAME-*.png`` in it.
         device: where to compute.
         report: called with run, policy and its comparison with greedy as soon as it is known.
         tell: called with the table before pictures are drawn, then with a line that says where they are or why there are
