@@ -5,9 +5,9 @@ Rollout and Policy Iteration with Application to Autonomous Sequential Repair Pr
 paper" in all docstrings.
 """
 
-from torchrl_pomdp.gym_ids import register
+from torchrl_pomdp.gym_ids import register_ids
 
 __version__ = "0.1.0"
 
-register()
-del register
+register_ids()
+del register_ids
