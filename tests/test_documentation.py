@@ -18,9 +18,12 @@ SMALL = {
         "ITERATIONS": 1, "SAMPLES_PER_PART": 40, "TRAJECTORIES": 2, "OPTIMIZATION_STEPS": 5, "EVALUATION_STATES": 20,
     },
     "02_ppo": {"UPDATES": 1, "EVALUATION_STATES": 20},
-    "02_rollout_improves": {"PLAYED": 12, "SEEDS": 1, "SIMULATED": "(1, 4)", "CUTS": "(2, 6)", "RELATIVE_GAP": 0.005},
+    "02_rollout_improves": {"PLAYED": 12, "SEEDS": 1, "SIMULATED": (1, 4), "CUTS": (2, 6), "RELATIVE_GAP": 0.005},
     "03_policy_iteration_torchrl": {
         "ITERATIONS": 2, "SAMPLES": 60, "TRAJECTORIES": 2, "OPTIMIZATION_STEPS": 50, "EVALUATION_STATES": 20,
+    },
+    "04_partitions_and_truncation": {
+        "LOCATIONS": 4, "PLAYED": 8, "CHECKED": 50, "SAMPLES": 40, "OPTIMIZATION_STEPS": 20, "CUTS": (1, 4),
     },
 }  # fmt: skip
 # What every tutorial prints, at any size.
@@ -29,6 +32,7 @@ PRINTED = {
     "02_ppo": ["greedy: "],
     "02_rollout_improves": ["the optimal cost is between 168.", "one-step rollout: ", "two-step lookahead: "],
     "03_policy_iteration_torchrl": ["iteration 2: cost ", "mean error of the value network: ", "it was read from the folder"],
+    "04_partitions_and_truncation": ["0 of ", "right -> left: ", "on leaving the part: ", "pAPI-T: "],
 }
 
 
