@@ -214,7 +214,10 @@ for (name, policy), marker, colour in zip(others.items(), "D^vP", ("black", GREE
     axis.errorbar([steps], [ratio], [half], fmt=marker, markersize=8, capsize=3, color=colour, label=name)
     print(f"{name}: {ratio:.3f} of greedy's cost, {steps:.0f} simulated steps and {milliseconds:.2f} ms for each decision")
 axis.axhline(1.0, color=GREY, linestyle="--", label="greedy")
-axis.set(xscale="log", xlabel="simulated steps for each decision", ylabel="cost, ratio to greedy")
+axis.set(xscale="log", yscale="log", xlabel="simulated steps for each decision", ylabel="cost, ratio to greedy")
+axis.set_xticks((5, 10, 20, 50, 100), ("5", "10", "20", "50", "100"))
+axis.set_yticks((0.8, 1, 1.2, 1.5, 2, 3, 5, 8), ("0.8", "1", "1.2", "1.5", "2", "3", "5", "8"))
+axis.minorticks_off()
 axis.legend(frameon=False, fontsize="small")
 plt.show()
 
