@@ -166,6 +166,32 @@ def test_rollout_policies_are_base_policies_of_the_label_collectors(kind):
     assert collector.labeller is not base
 
 
+def test_copies_of_policies_are_simulated_by_compiled_loops_too():
+    pytest.importorskip("numba")
+    policy = PartitionedPolicy([GREEDY, *[UrgencyRepair(MODEL)] * 5])
+    for each in (GREEDY, UrgencyRepair(MODEL), policy, pickle.loads(pickle.dumps(GREEDY))):
+        assert (TruncatedRollout(MODEL, each).scalar is None) == (each is policy)
+        assert (TruncatedRollout(MODEL, copy.deepcopy(each)).scalar is None) == (each is policy)
+    options = {"states": PROBLEM.training[0], "frames_per_batch": 2, "total_frames": 2}
+    collector = RolloutImprovement(BeliefEnv(MODEL, PROBLEM.start), GREEDY, **options)
+    assert collector.labeller.cost_to_go.scalar is not None
+    assert TruncatedRollout(make_problem("linear20").model, GREEDY).scalar is None, "another graph"
+
+
+def test_local_policies_are_replaced_by_others_that_read_more():
+    network = PolicyNetwork(RelativeEncoder(MODEL), 3, generator=torch.Generator().manual_seed(0))
+    policy, keys = PartitionedPolicy([GREEDY] * 6), torch.arange(4)
+    cost, fresh = TruncatedRollout(MODEL, policy), TruncatedRollout(MODEL, PartitionedPolicy([network] * 6))
+    cost.scalar = fresh.scalar = None  # by tensors, to which the features that are read matter
+    y = PROBLEM.start(keys)
+    before = cost(y, keys)
+    for part in range(6):
+        policy.policies[part] = network
+    after = cost(y, keys)
+    assert torch.equal(after, fresh(y, keys))
+    assert not torch.equal(after, before)
+
+
 def test_policy_iteration_starts_from_a_rollout_policy():
     config = PolicyIterationConfig(
         iterations=1,

@@ -191,10 +191,6 @@ class TruncatedRollout(nn.Module):
             check_callable("terminal_cost", terminal_cost)
         self.model, self.base_policy, self.truncation = model, base_policy, truncation
         self.max_steps, self.terminal_cost, self.chunk_rows = max_steps, terminal_cost, chunk_rows
-        # Features that are not read at every step are not computed at every step.
-        self._keys = _read_by(base_policy)
-        if self._keys and truncation is not None:
-            self._keys += truncation.in_keys
         self._compile = check_flag("compile", compile)
         powers = model.discount ** torch.arange(max_steps + 1, dtype=torch.float64)
         self.register_buffer("_discounts", powers.to(model.device, model.dtype), persistent=False)
@@ -301,6 +297,11 @@ class TruncatedRollout(nn.Module):
                 live = live.rows(~live.ended)
         return steps
 
+    def _read_keys(self) -> tuple[str, ...] | None:
+        """Features read at every step, no others are computed; None, all of them. Local policies may have been replaced."""
+        keys = _read_by(self.base_policy)
+        return keys and (*keys, *(() if self.truncation is None else self.truncation.in_keys))
+
     def _check_policy(self, y: TensorDictBase) -> None:
         """Raise unless the policy's controls at some of the first states are legal; later ones are not looked at."""
         rows = y[:_CHECKED].clone()
@@ -310,7 +311,7 @@ class TruncatedRollout(nn.Module):
     def _admit(self, y: TensorDictBase, scenarios: Scenarios, first: int, last: int, total: Tensor) -> _Live:
         """The trajectories number ``first`` to ``last``, at their start."""
         number = torch.arange(first, min(last, total.numel()), device=total.device)
-        start = self.model.derive(y[first:last].clone(), self._keys)
+        start = self.model.derive(y[first:last].clone(), self._read_keys())
         age, memory = torch.zeros_like(number), number.new_zeros(number.numel(), 0)
         if self.truncation is not None:
             memory = self.truncation.start(self.model.derive(start))

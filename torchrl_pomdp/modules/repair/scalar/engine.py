@@ -93,7 +93,10 @@ def repair_engine(
         >>> type(TruncatedRollout(model, Costliest(model)).scalar).__name__
         'RepairEngine'
     """
-    if type(model) is not RepairModel or own.graph is not model.graph or not torch.equal(own.costs, model.costs):
+    # By content: a copy of a policy, such as a collector's, has a model of its own.
+    if type(model) is not RepairModel or not torch.equal(own.graph.neighbours, model.graph.neighbours):
+        return None
+    if not torch.equal(own.costs, model.costs):
         return None
     rules = () if limits.truncation is None else limits.truncation.rules
     known = all(type(rule) in (AfterSteps, OnEntering, OnLeaving) for rule in rules)
