@@ -34,7 +34,7 @@
 PROBLEM = "network32x8"  # 32 locations, 8 robots
 TRAJECTORIES = 10
 STAGES_AHEAD = 8
-EVALUATION_STATES = 100
+EVALUATION_STATES = 60
 SAMPLES = 6000
 OPTIMIZATION_STEPS = 1500
 FRAMES = 18
@@ -105,22 +105,22 @@ autonomous = MultiagentRollout(model, greedy, scheme="autonomous", **options)
 policies = {"greedy": greedy, "urgency": problem.base_policies["urgency"], "autonomous": autonomous, "one at a time": in_turn}
 
 
-def evaluate(problem, policies, baseline):
-    """Costs of policies from the same start states, beside those of a baseline."""
-    costs = {
-        name: discounted_costs(
-            problem.model,
-            policy,
-            problem.start,
-            num_states=EVALUATION_STATES,
-            terminal_cost=problem.pessimistic_cost,
-        )
+def evaluate(problem, policies):
+    """Discounted costs of policies from the same start states; what is left at the end of the simulation is estimated."""
+    rest = problem.pessimistic_cost
+    return {
+        name: discounted_costs(problem.model, policy, problem.start, num_states=EVALUATION_STATES, terminal_cost=rest)
         for name, policy in policies.items()
     }
+
+
+def against(baseline, costs):
+    """Costs beside those of a baseline, paired by start state."""
     return [Result(name, compare(each, costs[baseline])) for name, each in costs.items()]
 
 
-results = evaluate(problem, policies, "greedy")
+costs = evaluate(problem, policies)
+results = against("greedy", costs)
 print(table(results))
 cost_figure(results, f"{model.num_robots} robots; below, the ratio to greedy")
 
@@ -151,14 +151,9 @@ print(iteration.reason)
 
 # %%
 signalled = MultiagentRollout(model, greedy, scheme="autonomous", signalling=network, **options)
-policies = {
-    "greedy": greedy,
-    "autonomous": autonomous,
-    "signalled": signalled,
-    "one at a time": in_turn,
-    "network": network,
-}
-results = evaluate(problem, policies, "greedy")
+costs |= evaluate(problem, {"signalled": signalled, "network": network})
+results = against("greedy", {name: costs[name] for name in ("greedy", "autonomous", "signalled", "one at a time", "network")})
+print(table(results))
 cost_figure(results, f"{model.num_robots} robots; below, the ratio to greedy")
 
 # %% [markdown]
@@ -206,7 +201,7 @@ policies = {
     "rollout of it": MultiagentRollout(changed.model, old, **options),
     "greedy made anew": changed.base_policies["greedy"],
 }
-results = evaluate(changed, policies, "old policy")
+results = against("old policy", evaluate(changed, policies))
 print(table(results))
 cost_figure(results, "after the change; below, the ratio to the old policy")
 

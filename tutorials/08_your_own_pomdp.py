@@ -143,7 +143,8 @@ policies = {
 }
 costs = {name: discounted_costs(pump, policy, new, num_states=ROLLOUT_STATES) for name, policy in policies.items()}
 results = [Result(name, compare(each, costs["rule"])) for name, each in costs.items()]
-figure = cost_figure(results, "one pump, in 100 €; ratios to the rule")
+figure = cost_figure(results, "one pump; below, the ratio to the rule")
+figure.axes[0].set_ylabel("discounted cost, 100 €")
 figure.axes[0].axhspan(solution.lower, solution.upper, color="#d55e00", alpha=0.6, zorder=3)
 figure
 
@@ -456,7 +457,8 @@ model = problem.model  # the same as `pumps`, with a partition of a single part,
 costs = {name: discounted_costs(model, policy, all_new, num_states=EVALUATION_STATES) for name, policy in policies.items()}
 results = [Result(name, compare(each, costs["worst first"])) for name, each in costs.items()]
 print(table(results))
-figure = cost_figure(results, f"{PUMPS} pumps, in 100 €; ratios to the rule")
+figure = cost_figure(results, f"{PUMPS} pumps; below, the ratio to the rule")
+figure.axes[0].set_ylabel("discounted cost, 100 €")
 figure.axes[0].axhline(PUMPS * solution.lower, color="#d55e00")
 figure
 
@@ -479,7 +481,9 @@ figure
 
 # %%
 folder = Path(tempfile.mkdtemp())
-save_checkpoint(folder / "pumps.pt", Checkpoint(problem, config, "pAPI-NT", iterations[-1].number, trained, iterations[-1].value))
+save_checkpoint(
+    folder / "pumps.pt", Checkpoint(problem, config, "pAPI-NT", iterations[-1].number, trained, iterations[-1].value)
+)
 controller = Controller.from_checkpoint(folder / "pumps.pt", problem=problem)
 controller.reset(all_new(torch.tensor(0)))
 print("first control:", controller.act().names)
