@@ -25,7 +25,7 @@
 # | POMCP | `planners.POMCP` | simulations grow a tree of what may be done and seen (Silver and Veness, 2010) |
 # | DESPOT | `planners.DESPOT` | a tree over a few fixed scenarios, searched by bounds (Somani and others, 2013) |
 # | PPO | TorchRL's `ClipPPOLoss` | a policy gradient method; learns from trajectories, plans nothing |
-# | paired interval | `compare` | interval of a difference or ratio, start state by start state: much narrower than that of a cost |
+# | paired interval | `compare` | interval of a difference or ratio, start state by start state: much narrower than a cost's |
 #
 # The tree searches and the fast rollout are compiled by numba: the extra *fast*.
 
@@ -78,9 +78,9 @@ print(model.describe())
 # %% [markdown]
 # ## PPO
 #
-# `BeliefEnv` is a TorchRL environment like any other, so TorchRL's PPO runs on it. `PolicyNetwork.actor()` draws controls among those
-# that `"action_mask"` says are legal. Nothing below is special to this library but the environment and the network; `trainers.ppo` does
-# the same with more care, for large problems.
+# `BeliefEnv` is a TorchRL environment like any other, so TorchRL's PPO runs on it. `PolicyNetwork.actor()` draws controls
+# among those that `"action_mask"` says are legal. Nothing below is special to this library but the environment and the
+# network; `trainers.ppo` does the same with more care, for large problems.
 
 # %%
 torch.manual_seed(0)  # of PPO's own draws
@@ -107,8 +107,8 @@ advantage = GAE(gamma=model.discount, lmbda=0.95, value_network=critic)
 optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
 
 # %% [markdown]
-# Rewards are minus the expected stage costs. Policies are compared by *discounted* cost, which is not the return of an episode that
-# PPO would log; so the curve is evaluated separately.
+# Rewards are minus the expected stage costs. Policies are compared by *discounted* cost, which is not the return of an episode
+# that PPO would log; so the curve is evaluated separately.
 
 
 # %%
@@ -146,9 +146,9 @@ plt.show()
 # %% [markdown]
 # ## Planners
 #
-# All three planners simulate from the present belief, and differ in what they do with simulations. We give each a budget, from a few
-# simulations to many, and the same base policy, greedy. For POMCP there is also a second line: with random play in place of
-# the base policy, as it comes out of the box.
+# All three planners simulate from the present belief, and differ in what they do with simulations. We give each a budget, from
+# a few simulations to many, and the same base policy, greedy. For POMCP there is also a second line: with random play in place
+# of the base policy, as it comes out of the box.
 
 
 # %%
@@ -220,18 +220,18 @@ print(table([Result(name, compare(costs, baseline)) for name, costs in last.item
 # %% [markdown]
 # How to read it. Each point is a method with a budget; the table has the largest ones.
 #
-# - **DESPOT and PPO are better than rollout here**: they reach the optimum. Rollout looks one step ahead, and then greedy goes on; so it is
-#   better than greedy, but more trajectories do not make it better still. Its way to the optimum is to do it again, with the
-#   improved policy as base policy: that is policy iteration, and tutorial 1 reaches the optimum so.
+# - **DESPOT and PPO are better than rollout here**: they reach the optimum. Rollout looks one step ahead, and then greedy goes
+#   on; so it is better than greedy, but more trajectories do not make it better still. Its way to the optimum is to do it
+#   again, with the improved policy as base policy: that is policy iteration, and tutorial 1 reaches the optimum so.
 # - **Rollout is the fastest planner**: less than a millisecond.
-# - **PPO** decides by a single network evaluation. It had to see some forty thousand belief steps first, and would have to see them
-#   again for another problem.
+# - **PPO** decides by a single network evaluation. It had to see some forty thousand belief steps first, and would have to see
+#   them again for another problem.
 # - **POMCP** with greedy comes as far as rollout at these budgets. With random play it starts worse than greedy.
 #
 # ## A problem with 10¹⁵ states
 #
-# The same on a line of twenty locations. PPO is not here: it takes a million belief steps to
-# cost 0.95 of what greedy does, and two million for 0.90 (`trainers.ppo` says so in its documentation), which is more than a tutorial has time for.
+# The same on a line of twenty locations. PPO is not here: it takes a million belief steps to cost 0.95 of what greedy does,
+# and two million for 0.90 (`trainers.ppo` says so in its documentation), which is more than a tutorial has time for.
 
 # %%
 large = make_problem("linear20")
@@ -244,17 +244,17 @@ last = {"greedy": large_baseline} | {name: points[-1][1] for name, points in lar
 print(table([Result(name, compare(costs, large_baseline)) for name, costs in last.items()]))
 
 # %% [markdown]
-# - **Random play is hopeless here**: it is so costly that the tree learns about random play. Most of what a planner is worth is its
-#   base policy.
+# - **Random play is hopeless here**: it is so costly that the tree learns about random play. Most of what a planner is worth
+#   is its base policy.
 # - With greedy, all three are better than greedy. DESPOT has the lowest mean, and takes more than ten times as long as rollout.
 # - Where intervals overlap nothing can be said about which of two methods is better. Take more start states before you choose:
 #   intervals shrink with the square root of their number.
 #
 # # Where to go on
 #
-# - `torchrl-pomdp compare linear20 --states 100 --seconds 0.02` gives every method the same *time* for a decision, and keeps what it
-#   has measured; `--checkpoint` adds a trained policy and PPO with as many belief steps.
+# - `torchrl-pomdp compare linear20 --states 100 --seconds 0.02` gives every method the same *time* for a decision, and keeps
+#   what it has measured; `--checkpoint` adds a trained policy and PPO with as many belief steps.
 # - `trainers.ppo(problem, steps=2_000_000)` is PPO for large problems.
 # - Networks that imitate rollout decide as fast as PPO's, and are trained with the model: tutorials 1 and 3.
-# - Your own problem: tutorial 8. The tree searches need arrays (`TabularModel`) or a repair problem; rollout and PPO take any belief
-#   model.
+# - Your own problem: tutorial 8. The tree searches need arrays (`TabularModel`) or a repair problem; rollout and PPO take any
+#   belief model.

@@ -149,9 +149,9 @@ figure.axes[0].axhspan(solution.lower, solution.upper, color="#d55e00", alpha=0.
 figure
 
 # %% [markdown]
-# The orange line is the optimum. Nobody can be below it but by luck of the draw: the whiskers, 95 % intervals, say how much luck
-# there is. Rollout needs enough trajectories: with 5 instead of 20 it is *worse* than the rule, since the control that looks best
-# is then often the one that was lucky.
+# The orange line is the optimum. Nobody can be below it but by luck of the draw: the whiskers, 95 % intervals, say how much
+# luck there is. Rollout needs enough trajectories: with 5 instead of 20 it is *worse* than the rule, since the control that
+# looks best is then often the one that was lucky.
 #
 # ## What the policy knows, and what is true
 #
@@ -433,9 +433,9 @@ def worst_first(y):
 problem = Problem(pumps, all_new, name="pumps", base_policies={"worst first": worst_first})
 
 # %% [markdown]
-# `papi_nt` is the paper's policy iteration. Each iteration labels states with the control that rollout of the last policy finds,
-# teaches a network to imitate them, and compares the network with the best policy so far, on the same start states and the same
-# noise. It is accepted only where it is better beyond doubt.
+# `papi_nt` is the paper's policy iteration. Each iteration labels states with the control that rollout of the last policy
+# finds, teaches a network to imitate them, and compares the network with the best policy so far, on the same start states and
+# the same noise. It is accepted only where it is better with 95 % confidence.
 
 # %%
 config = PolicyIterationConfig(
@@ -463,8 +463,8 @@ figure.axes[0].axhline(PUMPS * solution.lower, color="#d55e00")
 figure
 
 # %% [markdown]
-# The orange line is a bound that comes for free: with a technician for each pump the cost would be that of so many single pumps,
-# and one technician can do no better than many.
+# The orange line is a bound that comes for free: with a technician for each pump the cost would be that of so many single
+# pumps, and one technician can do no better than many.
 #
 # The same from the command line: put the code into a file `pumps.py`, with `problem` made by a function
 # `def make(): return Problem(...)`, and then
@@ -533,11 +533,11 @@ plt.show()
 # %% [markdown]
 # # Where to go on
 #
-# - **Your problem.** Up to some thousand states: arrays, dense or sparse (`TabularModel`), or a file `.POMDP` (`read_pomdp`). More:
-#   find what makes the belief small, as the independence of the pumps did here, and write a belief model.
+# - **Your problem.** Up to some thousand states: arrays, dense or sparse (`TabularModel`), or a file `.POMDP` (`read_pomdp`).
+#   More: find what makes the belief small, as the independence of the pumps did here, and write a belief model.
 # - **Illegal controls**: return them as False from `action_mask`; nobody will ever choose them.
 # - **An end**: override `is_terminal`.
-# - **A better network input**: an `Encoder` of your own, given to `Problem` as `encoder`. **Several networks**: a `FunctionPartition`
-#   given to `BeliefModel.__init__`.
+# - **A better network input**: an `Encoder` of your own, given to `Problem` as `encoder`. **Several networks**: a
+#   `FunctionPartition` given to `BeliefModel.__init__`.
 # - **Many technicians**: joint controls grow too many to be enumerated; tutorial 6 lets one decide after the other.
 # - **More computers**: tutorial 7. **Tree searches and PPO beside it**: tutorial 5.
