@@ -63,8 +63,8 @@ logger.setLevel("WARNING")
 # %% [markdown]
 # ## The network
 #
-# Locations are coloured by the damage that is expected there; a robot sees the damage where it stands. The numbered discs are the
-# robots, arrows and plus signs are what the greedy policy tells them to do.
+# Locations are coloured by the damage that is expected there; a robot sees the damage where it stands. The numbered discs are
+# the robots, arrows and plus signs are what the greedy policy tells them to do.
 
 # %%
 problem = make_problem(PROBLEM)
@@ -80,10 +80,10 @@ network_figure(model, y, control=greedy(y.clone())["action"], title="greedy: eve
 #
 # ## One robot after the other
 #
-# Rollout tries every control. With eight robots and five controls each that would be 5⁸ joint controls, 390 625. But there is a
-# way around: let the robots decide in turn. Robot 1 tries its own five controls, while the others follow the base policy. Robot 2
-# does the same, but knows what robot 1 has decided, and so on. That takes R·A = 40 Q-factors instead of Aᴿ (fewer, where some are illegal), and the paper shows
-# that, with exact Q-factors, it still is no worse than the base policy.
+# Rollout tries every control. With eight robots and five controls each that would be 5⁸ joint controls, 390 625. But there is
+# a way around: let the robots decide in turn. Robot 1 tries its own five controls, while the others follow the base policy.
+# Robot 2 does the same, but knows what robot 1 has decided, and so on. That takes R·A = 40 Q-factors instead of Aᴿ (fewer,
+# where some are illegal), and the paper shows that, with exact Q-factors, it still is no worse than the base policy.
 #
 # Simulations are cut after a few stages, and a simple estimate of what is left, `problem.pessimistic_cost`, is added.
 
@@ -125,14 +125,14 @@ print(table(results))
 cost_figure(results, f"{model.num_robots} robots; below, the ratio to greedy")
 
 # %% [markdown]
-# *urgency*, which weighs damage against distance, is a better base policy, and free. Robots that guess wrongly are much worse than
-# robots that take turns, and worse than urgency.
+# *urgency*, which weighs damage against distance, is a better base policy, and free. Robots that guess wrongly are much worse
+# than robots that take turns, and worse than urgency.
 #
 # ## A network that all robots share
 #
-# A better guess is a policy that imitates the robots that took turns. `trainers.api` labels states by rollout one at a time and
-# trains an `AgentNetwork`: one network, called once for each robot, which is shown where that robot is and what the earlier ones have
-# chosen. The same weights serve every robot.
+# A better guess is a policy that imitates the robots that took turns. `trainers.api` labels states by rollout one at a time
+# and trains an `AgentNetwork`: one network, called once for each robot, which is shown where that robot is and what the
+# earlier ones have chosen. The same weights serve every robot.
 
 # %%
 config = PolicyIterationConfig(
@@ -157,13 +157,13 @@ print(table(results))
 cost_figure(results, f"{model.num_robots} robots; below, the ratio to greedy")
 
 # %% [markdown]
-# With the network as signalling policy robots that do not wait are nearly as good as robots that do. The network alone, which simulates
-# nothing when it decides, is about as good.
+# With the network as signalling policy robots that do not wait are nearly as good as robots that do. The network alone, which
+# simulates nothing when it decides, is about as good.
 #
 # ## See it
 #
-# Both animations start in the same state. Greedy robots end up in a pack, since what is nearest to one is nearest to all; robots
-# that take turns spread over the network.
+# Both animations start in the same state. Greedy robots end up in a pack, since what is nearest to one is nearest to all;
+# robots that take turns spread over the network.
 
 # %%
 env = BeliefEnv(model, problem.start, seed=4)
@@ -180,8 +180,8 @@ Image(film.read_bytes())
 # ## The model changes
 #
 # A robot breaks down at location 13, and the way between 14 and 24 is blocked. The policy, here urgency, was made for another
-# world. Training anew takes time; rollout does not. It takes the *new* model and the *old* policy as its base policy, and repairs the old policy's
-# mistakes at once, because it sees in simulation what they lead to.
+# world. Training anew takes time; rollout does not. It takes the *new* model and the *old* policy as its base policy, and
+# repairs the old policy's mistakes at once, because it sees in simulation what they lead to.
 #
 # `OldPolicy` lets the old policy go on as if nothing had happened: for it, the lost robot stands where it broke down.
 
