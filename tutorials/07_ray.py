@@ -34,7 +34,7 @@ WORKERS = 2
 ITERATIONS = 2
 SAMPLES_PER_PART = 300
 OPTIMIZATION_STEPS = 200
-EVALUATION_STATES = 1000
+EVALUATION_STATES = 500
 
 # %%
 # %matplotlib inline
@@ -57,9 +57,9 @@ plt.rcParams["figure.constrained_layout.use"] = True
 # %% [markdown]
 # ## A problem of four parts
 #
-# Behind one of two doors is a tiger. Listening costs 1 and tells the side, right in 85 of 100 cases; the tiger's door costs 100, the
-# other one pays 10. The belief is the probability that the tiger is on the left. We cut it into four parts, by a function of the
-# feature state; each will have a network of its own.
+# Behind one of two doors is a tiger. Listening costs 1 and tells the side, right in 85 of 100 cases; the tiger's door costs
+# 100, the other one pays 10. The belief is the probability that the tiger is on the left. We cut it into four parts, by a
+# function of the feature state; each will have a network of its own.
 
 
 # %%
@@ -101,22 +101,23 @@ for iteration in alone:
 # ## The same on Ray
 #
 # `RayWorkers()` without an address starts a cluster on this machine. It can be reached from this machine alone, and has no
-# dashboard. It is stopped at the end of the `with` block, whatever happens inside. With `RayWorkers("10.0.0.1:6379")` it would be a
-# cluster that is running already.
+# dashboard. With `RayWorkers("10.0.0.1:6379")` it would be a cluster that is running already. In a script write
+# `with RayWorkers() as workers:`, which stops Ray at the end, whatever happens inside; here it serves several cells, and
+# `workers.close()` stops it.
 #
 # The recipe is the same, with one more argument.
 
 # %%
-with RayWorkers(num_workers=WORKERS) as workers:
-    begin = time.perf_counter()
-    together = list(papi_nt(problem, config, base, workers=workers))
-    seconds["Ray"] = time.perf_counter() - begin
+workers = RayWorkers(num_workers=WORKERS)
+begin = time.perf_counter()
+together = list(papi_nt(problem, config, base, workers=workers))
+seconds["Ray"] = time.perf_counter() - begin
 for iteration in together:
     print(f"iteration {iteration.number}: {iteration.reason}")
 
 # %% [markdown]
-# Is it the same? Labels, visited states and batches are functions of seeds and numbers, never of who computes them, or when. So the
-# networks must be equal, not almost equal. Each dot is a weight of the last networks.
+# Is it the same? Labels, visited states and batches are functions of seeds and numbers, never of who computes them, or when.
+# So the networks must be equal, not almost equal. Each dot is a weight of the last networks.
 
 
 # %%
@@ -138,20 +139,20 @@ print("equal to the last bit:", all(torch.equal(weights(a), weights(b)) for a, b
 # On a problem this small, and on two cores, Ray may well be slower: processes must start, and data must be sent. It pays where
 # labels take minutes.
 #
-# That results do not depend on the workers has a use: a run can be begun on a laptop and gone on with on a cluster, and a worker
-# that dies costs time but changes nothing: its task is done again, with the same seeds.
+# That results do not depend on the workers has a use: a run can be begun on a laptop and gone on with on a cluster, and a
+# worker that dies costs time but changes nothing: its task is done again, with the same seeds.
 #
 # ## Parts that do not wait for each other
 #
-# Above, a part that is done waits until all are. On a cluster of unequal machines that wastes time. `AsynchronousIteration` lets every
-# part go on: it labels with whatever networks the others have published by then. The only rule is the bound on staleness: a part
-# may be at most so many versions ahead of the last one. With a bound, the theory of asynchronous policy iteration applies
-# (Bertsekas and Yu, 2010).
+# Above, a part that is done waits until all are. On a cluster of unequal machines that wastes time. `AsynchronousIteration`
+# lets every part go on: it labels with whatever networks the others have published by then. The only rule is the bound on
+# staleness: a part may be at most so many versions ahead of the last one. With a bound, the theory of asynchronous policy
+# iteration applies (Bertsekas and Yu, 2010).
 
 # %%
-with RayWorkers(num_workers=WORKERS) as workers:
-    run = AsynchronousIteration(papi_nt(problem, config, base, workers=workers), staleness=1)
-    asynchronous = list(run)
+run = AsynchronousIteration(papi_nt(problem, config, base, workers=workers), staleness=1)
+asynchronous = list(run)
+workers.close()
 print("Ray is running:", ray.is_initialized())
 for iteration in asynchronous:
     print(f"iteration {iteration.number}: {iteration.reason}")
@@ -207,8 +208,8 @@ plt.show()
 # %% [markdown]
 # ## What a cluster gives
 #
-# This figure was made by `python -m benchmarks scaling`: the costs of labelling, sending and training were measured on two cores, and a
-# simulation played a step of policy iteration on larger clusters. It is a prediction, not a measurement.
+# This figure was made by `python -m benchmarks scaling`: the costs of labelling, sending and training were measured on two
+# cores, and a simulation played a step of policy iteration on larger clusters. It is a prediction, not a measurement.
 #
 # ![speed-up against workers](../benchmarks/scaling.png)
 #
@@ -225,6 +226,7 @@ plt.show()
 #
 # # Where to go on
 #
-# - `torchrl-pomdp train linear20 --backend ray --workers 8`, or `--address` for a running cluster; add `--out` to be able to go on.
+# - `torchrl-pomdp train linear20 --backend ray --workers 8`, or `--address` for a running cluster; add `--out` to be able to
+#   go on.
 # - More parts: a `FunctionPartition` of your own.
 # - Many robots, whose labels take long: tutorial 6. A problem of your own: tutorial 8.
