@@ -28,7 +28,6 @@ SMALL = {
     "01_policy_iteration": {
         "ITERATIONS": 1, "SAMPLES_PER_PART": 40, "TRAJECTORIES": 2, "OPTIMIZATION_STEPS": 5, "EVALUATION_STATES": 20,
     },
-    "02_ppo": {"UPDATES": 1, "EVALUATION_STATES": 20},
     "02_rollout_improves": {"PLAYED": 12, "SEEDS": 1, "SIMULATED": (1, 4), "CUTS": (2, 6), "RELATIVE_GAP": 0.005},
     "03_policy_iteration_torchrl": {
         "ITERATIONS": 2, "SAMPLES": 60, "TRAJECTORIES": 2, "OPTIMIZATION_STEPS": 50, "EVALUATION_STATES": 20,
@@ -36,16 +35,32 @@ SMALL = {
     "04_partitions_and_truncation": {
         "LOCATIONS": 4, "PLAYED": 8, "CHECKED": 50, "SAMPLES": 40, "OPTIMIZATION_STEPS": 20, "CUTS": (1, 4),
     },
+    "05_peers": {
+        "UPDATES": 1, "EVALUATION_STATES": 20, "STATES": 4, "BUDGETS": [2], "LARGE_STATES": 2, "LARGE_BUDGETS": [2],
+    },
+    "06_many_robots": {
+        "TRAJECTORIES": 2, "STAGES_AHEAD": 2, "EVALUATION_STATES": 4, "SAMPLES": 50, "OPTIMIZATION_STEPS": 5, "FRAMES": 2,
+    },
+    "07_ray": {"ITERATIONS": 1, "SAMPLES_PER_PART": 30, "OPTIMIZATION_STEPS": 5, "EVALUATION_STATES": 20},
+    "08_your_own_pomdp": {
+        "PUMPS": 2, "TRAJECTORIES": 2, "ROLLOUT_STATES": 10, "EVALUATION_STATES": 100, "SAMPLES": 100, "ITERATIONS": 1,
+        "OPTIMIZATION_STEPS": 5, "WEEKS": 6,
+    },
 }  # fmt: skip
 # What every tutorial prints, at any size.
 PRINTED = {
     "01_policy_iteration": ["| greedy |"],
-    "02_ppo": ["greedy: "],
     "02_rollout_improves": ["the optimal cost is between 168.", "one-step rollout: ", "two-step lookahead: "],
     "03_policy_iteration_torchrl": ["iteration 2: cost ", "mean error of the value network: ", "it was read from the folder"],
     "04_partitions_and_truncation": ["0 of ", "right -> left: ", "on leaving the part: ", "pAPI-T: "],
-}
-
+    "05_peers": ["| PPO |", "| DESPOT |", "| POMCP, random play |", "the optimum: 168.97"],
+    "06_many_robots": ["31 Q-factors for one decision of 8 robots", "| signalled |", "| rollout of it |"],
+    "07_ray": ["equal to the last bit: True", "the bound was kept: True", "Ray is running: False"],
+    "08_your_own_pomdp": [
+        "row (0, 1) sums to 1.1", "Careless: advance: the stage cost", "Undivided: advance: the next state",
+        "the model and the arrays agree", "got 'looks blue'", "state unchanged: True", "restarted, 3 controls are behind us",
+    ],
+}  # fmt: skip
 
 PAGES = sorted(
     [
@@ -55,8 +70,6 @@ PAGES = sorted(
         *(ROOT / "docs" / "howto").glob("*.md"),
     ]
 )
-# Made by the report, not here yet.
-LATER = {"docs/images/repair.gif"}
 DOCUMENTS = sorted(
     [*PAGES, *(ROOT / "docs" / "api").glob("*.md"), ROOT / "CONTRIBUTING.md", *(ROOT / "results").glob("**/README.md")]
 )
@@ -136,7 +149,7 @@ def test_links_lead_somewhere(document):
             path = (document.parent / parts.path).resolve()
             # In the documentation results and tutorials lie beside its own pages.
             beside = ROOT / path.relative_to(ROOT / "docs") if path.is_relative_to(ROOT / "docs") else path
-            assert path.exists() or beside.exists() or target in LATER, target
+            assert path.exists() or beside.exists(), target
 
 
 def test_the_readme_is_short_and_links_its_pages():
@@ -221,7 +234,9 @@ def test_notebooks_are_their_scripts(script):
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-def test_tutorials_run_at_a_small_size(script):
+def test_tutorials_run_at_a_small_size(script, monkeypatch):
+    # Ray's workers give way to all other processes: beside other tests they would hardly get on.
+    monkeypatch.setenv("RAY_worker_niceness", "0")
     notebook = jupytext.read(script)
     (parameters,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
     for name, value in SMALL[script.stem].items():
