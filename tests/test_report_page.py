@@ -58,6 +58,9 @@ def test_the_page_holds_what_the_run_found(copied):
             shown = f"{losses['accuracy']:.1%}" if "improve" in key else f"{losses['relative_error']:.1%}"
             assert f"<td>{shown}</td>" in text
     assert text.count("<circle") == 3, "the base policy and two iterations"
+    accepted = [each["number"] for each in json.loads((copied / "iterations.json").read_text()) if each["accepted"]]
+    best = [f"pAPI-T {accepted[-1]}"] if accepted else []
+    assert re.findall(r'class="best"><td class="text">(.*?)</td>', text) == best
     outside = re.findall(r"(?:src|href)=\"(?!#|data:)[^\"]*", text) + re.findall(r"https?://(?!www\.w3\.org/2000/svg)\S*", text)
     assert outside == [], "nothing is loaded from elsewhere"
 
@@ -101,7 +104,9 @@ def test_where_no_iteration_was_accepted_the_last_one_is_shown(copied):
     untrained = read_run_folder(copied, None).policy
     shutil.copy(copied / "iteration-2.pt", copied / "best.pt")
     assert list(read_run_folder(copied, None).policies) == ["greedy", "pAPI-T 2"]
-    assert untrained.iteration > 0
+    iterations = json.loads((copied / "iterations.json").read_text())
+    refused = [{**iteration, "accepted": False} for iteration in iterations]
+    (copied / "iterations.json").write_text(json.dumps(refused))
     from dataclasses import replace
 
     from torchrl_pomdp.trainers import save_checkpoint
@@ -109,6 +114,10 @@ def test_where_no_iteration_was_accepted_the_last_one_is_shown(copied):
     greedy = replace(untrained, iteration=0, policy=untrained.problem.base_policies["greedy"])
     save_checkpoint(copied / "best.pt", greedy)
     assert list(read_run_folder(copied, None).policies) == ["greedy", "pAPI-T 2"]
+    text = write_report(copied).read_text()
+    assert "No iteration was accepted, so the base policy is the best one; what is played below is pAPI-T 2." in text
+    assert 'class="best"' not in text
+    assert text.count('<circle class="hollow"') == 2
     for path in copied.glob("iteration-*.pt"):
         path.unlink()
     assert list(read_run_folder(copied, None).policies) == ["greedy"]
