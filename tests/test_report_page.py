@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from html import unescape
 
 import pytest
@@ -12,9 +13,11 @@ import torch
 from _runs import small_run
 
 from torchrl_pomdp.cli import main
+from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs import FixedBelief, TabularModel
 from torchrl_pomdp.evaluation import Estimate
-from torchrl_pomdp.files import DamagedFileError
+from torchrl_pomdp.files import DamagedFileError, write_json
+from torchrl_pomdp.modules import PartitionedValue
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.problems import Problem, make_problem
 from torchrl_pomdp.report import page, player
@@ -22,6 +25,7 @@ from torchrl_pomdp.report.disagreements import disagreements
 from torchrl_pomdp.report.iteration_chart import iteration_chart
 from torchrl_pomdp.report.page import write_report
 from torchrl_pomdp.report.run_folder import read_run_folder
+from torchrl_pomdp.trainers import Checkpoint, save_checkpoint
 from torchrl_pomdp.trajectories import play
 
 TITLES = ["Cost per iteration", "Policies", "Parts", "Where the policies disagree", "Trajectories"]
@@ -107,10 +111,6 @@ def test_where_no_iteration_was_accepted_the_last_one_is_shown(copied):
     iterations = json.loads((copied / "iterations.json").read_text())
     refused = [{**iteration, "accepted": False} for iteration in iterations]
     (copied / "iterations.json").write_text(json.dumps(refused))
-    from dataclasses import replace
-
-    from torchrl_pomdp.trainers import save_checkpoint
-
     greedy = replace(untrained, iteration=0, policy=untrained.problem.base_policies["greedy"])
     save_checkpoint(copied / "best.pt", greedy)
     assert list(read_run_folder(copied, None).policies) == ["greedy", "pAPI-T 2"]
@@ -248,8 +248,18 @@ def test_the_command_writes_the_page_and_an_animation(copied, tmp_path, capsys):
     assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a")
 
 
+def begun_run(folder, name):
+    """A run that has kept its base policy and no more."""
+    problem, config = make_problem(name), PolicyIterationConfig()
+    value = PartitionedValue([problem.pessimistic_cost] * problem.partition.num_parts)
+    base = problem.base_policies[problem.baseline]
+    save_checkpoint(folder / "best.pt", Checkpoint(problem, config, "API", 0, base, value))
+    write_json(folder / "config.json", {"problem": name, "algorithm": "API", "base": problem.baseline, "config": {}})
+    return folder
+
+
 def test_the_command_refuses_what_it_cannot_do(copied, tmp_path, capsys):
-    tiger = small_run(tmp_path / "tiger", "tiger")
+    tiger = begun_run(tmp_path / "tiger", "tiger")
     for arguments, message in {
         (str(tmp_path),): "folder must be that of a training run",
         (str(copied), "--animation", "a.png"): "animation must end in .gif or .mp4, got 'a.png'",
