@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from html import unescape
 
 import pytest
@@ -12,9 +13,11 @@ import torch
 from _runs import small_run
 
 from torchrl_pomdp.cli import main
+from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs import FixedBelief, TabularModel
 from torchrl_pomdp.evaluation import Estimate
-from torchrl_pomdp.files import DamagedFileError
+from torchrl_pomdp.files import DamagedFileError, write_json
+from torchrl_pomdp.modules import PartitionedValue
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.problems import Problem, make_problem
 from torchrl_pomdp.report import page, player
@@ -22,6 +25,7 @@ from torchrl_pomdp.report.disagreements import disagreements
 from torchrl_pomdp.report.iteration_chart import iteration_chart
 from torchrl_pomdp.report.page import write_report
 from torchrl_pomdp.report.run_folder import read_run_folder
+from torchrl_pomdp.trainers import Checkpoint, save_checkpoint
 from torchrl_pomdp.trajectories import play
 
 TITLES = ["Cost per iteration", "Policies", "Parts", "Where the policies disagree", "Trajectories"]
@@ -58,6 +62,9 @@ def test_the_page_holds_what_the_run_found(copied):
             shown = f"{losses['accuracy']:.1%}" if "improve" in key else f"{losses['relative_error']:.1%}"
             assert f"<td>{shown}</td>" in text
     assert text.count("<circle") == 3, "the base policy and two iterations"
+    accepted = [each["number"] for each in json.loads((copied / "iterations.json").read_text()) if each["accepted"]]
+    best = [f"pAPI-T {accepted[-1]}"] if accepted else []
+    assert re.findall(r'class="best"><td class="text">(.*?)</td>', text) == best
     outside = re.findall(r"(?:src|href)=\"(?!#|data:)[^\"]*", text) + re.findall(r"https?://(?!www\.w3\.org/2000/svg)\S*", text)
     assert outside == [], "nothing is loaded from elsewhere"
 
@@ -101,14 +108,16 @@ def test_where_no_iteration_was_accepted_the_last_one_is_shown(copied):
     untrained = read_run_folder(copied, None).policy
     shutil.copy(copied / "iteration-2.pt", copied / "best.pt")
     assert list(read_run_folder(copied, None).policies) == ["greedy", "pAPI-T 2"]
-    assert untrained.iteration > 0
-    from dataclasses import replace
-
-    from torchrl_pomdp.trainers import save_checkpoint
-
+    iterations = json.loads((copied / "iterations.json").read_text())
+    refused = [{**iteration, "accepted": False} for iteration in iterations]
+    (copied / "iterations.json").write_text(json.dumps(refused))
     greedy = replace(untrained, iteration=0, policy=untrained.problem.base_policies["greedy"])
     save_checkpoint(copied / "best.pt", greedy)
     assert list(read_run_folder(copied, None).policies) == ["greedy", "pAPI-T 2"]
+    text = write_report(copied).read_text()
+    assert "No iteration was accepted, so the base policy is the best one; what is played below is pAPI-T 2." in text
+    assert 'class="best"' not in text
+    assert text.count('<circle class="hollow"') == 2
     for path in copied.glob("iteration-*.pt"):
         path.unlink()
     assert list(read_run_folder(copied, None).policies) == ["greedy"]
@@ -239,8 +248,18 @@ def test_the_command_writes_the_page_and_an_animation(copied, tmp_path, capsys):
     assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a")
 
 
+def begun_run(folder, name):
+    """A run that has kept its base policy and no more."""
+    problem, config = make_problem(name), PolicyIterationConfig()
+    value = PartitionedValue([problem.pessimistic_cost] * problem.partition.num_parts)
+    base = problem.base_policies[problem.baseline]
+    save_checkpoint(folder / "best.pt", Checkpoint(problem, config, "API", 0, base, value))
+    write_json(folder / "config.json", {"problem": name, "algorithm": "API", "base": problem.baseline, "config": {}})
+    return folder
+
+
 def test_the_command_refuses_what_it_cannot_do(copied, tmp_path, capsys):
-    tiger = small_run(tmp_path / "tiger", "tiger")
+    tiger = begun_run(tmp_path / "tiger", "tiger")
     for arguments, message in {
         (str(tmp_path),): "folder must be that of a training run",
         (str(copied), "--animation", "a.png"): "animation must end in .gif or .mp4, got 'a.png'",

@@ -103,6 +103,9 @@ def _problem(run: RunFolder) -> str:
             ratio, interval = ratio_texts(best.comparison.ratio)
             against = f", {ratio} of {run.results[0].name} ({interval})" if best.comparison.ratio else ""
             lines.append(f"{best.name} costs {interval_text(best.comparison.cost)}{against}.")
+        if run.policy.name in _reasons(run)[1]:
+            last = run.policy.name
+            lines.append(f"No iteration was accepted, so the base policy is the best one; what is played below is {last}.")
     numbers = {**config["config"], "states": config.get("states"), "version": config.get("version")}
     rows = [(name, json.dumps(value)) for name, value in numbers.items()]
     details = f"<details><summary>All numbers of the run</summary>{_rows(('number', 'value'), rows, texts=2)}</details>"
@@ -113,18 +116,23 @@ def _costs(run: RunFolder) -> str:
     costs = [(r.name, r.comparison.cost) for r in run.results if r.name == run.config["base"] or is_iteration(r.name)]
     if not any(is_iteration(name) for name, _ in costs):
         return _section("Cost per iteration", _paragraph("No iteration is finished yet."))
-    names = [f"{run.config['algorithm']} {iteration['number']}" for iteration in run.iterations]
-    reasons = zip(names, run.iterations, strict=True)
-    rejected = {name: iteration["reason"] for name, iteration in reasons if not iteration.get("accepted")}
+    reasons, rejected = _reasons(run)
     text = "Means over the start states of the evaluation, with 95 % intervals. A hollow circle was not accepted."
-    told = [f"<li>{escape(name)}: {escape(each['reason'])}</li>" for name, each in zip(names, run.iterations, strict=True)]
+    told = [f"<li>{escape(name)}: {escape(reason)}</li>" for name, reason in reasons.items()]
     return _section("Cost per iteration", f"{_paragraph(text)}{iteration_chart(costs, rejected)}<ul>{''.join(told)}</ul>")
+
+
+def _reasons(run: RunFolder) -> tuple[dict[str, str], dict[str, str]]:
+    """Why each iteration was accepted or not; and of those that were not."""
+    named = {f"{run.config['algorithm']} {iteration['number']}": iteration for iteration in run.iterations}
+    reasons = {name: iteration["reason"] for name, iteration in named.items()}
+    return reasons, {name: reasons[name] for name, iteration in named.items() if not iteration.get("accepted")}
 
 
 def _table(run: RunFolder) -> str:
     if not run.results:
         return _section("Policies", _paragraph("No policy is evaluated yet."))
-    best = None if run.policy is None else run.policy.name
+    best = None if run.policy is None or run.policy.name in _reasons(run)[1] else run.policy.name
     rows = [
         (
             result.name,

@@ -5,7 +5,7 @@
   const SVG = "http://www.w3.org/2000/svg";
   // Lightness falls all the way: it is read without seeing colours.
   const RAMP = [[255, 255, 204], [254, 217, 118], [253, 141, 60], [227, 26, 28], [128, 0, 38]];
-  const STAGE_MS = 600;
+  const STAGE_MS = 600, LINE = 10;
   const make = (tag, attributes = {}, parent = null, text = "") => {
     const svg = parent instanceof SVGElement || tag === "svg";
     const node = svg ? document.createElementNS(SVG, tag) : document.createElement(tag);
@@ -27,14 +27,20 @@
     const xs = places.map(p => p[0]), ys = places.map(p => p[1]);
     const lengths = edges.map(([a, b]) => Math.hypot(xs[a] - xs[b], ys[a] - ys[b])).sort((a, b) => a - b);
     const unit = lengths.length ? lengths[lengths.length >> 1] : 1;
-    const at = places.map(p => [p[0] / unit, p[1] / unit]);
-    const [left, right] = [Math.min(...xs) / unit - 0.7, Math.max(...xs) / unit + 0.7];
-    const [top, bottom] = [Math.min(...ys) / unit - 0.8, Math.max(...ys) / unit + 0.7];
-    const box = make("div", right - left > 12 ? { class: "long" } : {}, parent);
+    // A long line goes on in the next row, as text does; left stays left.
+    const first = Math.min(...xs), isLine = ys.every(y => y === ys[0]) && (Math.max(...xs) - first) / unit > 12;
+    const row = x => isLine ? Math.floor((x - first) / unit / LINE + 1e-6) : 0;
+    const at = places.map(([x, y]) => [x / unit - LINE * row(x), y / unit + 1.5 * row(x)]);
+    const [left, right] = [Math.min(...at.map(p => p[0])) - 0.7, Math.max(...at.map(p => p[0])) + 0.7];
+    const [top, bottom] = [Math.min(...at.map(p => p[1])) - 0.8, Math.max(...at.map(p => p[1])) + 0.7];
+    const box = make("div", { class: right - left > 14 ? "long crowded" : right - left > 8 ? "long" : "" }, parent);
     make("div", { class: "soft" }, box, label);
     const svg = make("svg", { class: "net", role: "img", "aria-label": label,
       viewBox: `${left} ${top} ${right - left} ${bottom - top}` }, box);
-    for (const [a, b] of edges) make("line", { x1: at[a][0], y1: at[a][1], x2: at[b][0], y2: at[b][1] }, svg);
+    for (const [a, b] of edges) {
+      const kind = row(xs[a]) === row(xs[b]) ? "" : "wrap";
+      make("line", { class: kind, x1: at[a][0], y1: at[a][1], x2: at[b][0], y2: at[b][1] }, svg);
+    }
     const nodes = at.map(([x, y], i) => {
       const circle = make("circle", { class: "place", cx: x, cy: y, r: 0.3 }, svg);
       const title = make("title", {}, circle);
