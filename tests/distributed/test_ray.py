@@ -190,7 +190,13 @@ def interrupted(arguments, folder, how):
     """Start Python, end it in the middle of a step, and see that nothing is left of its cluster."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
     driver = subprocess.Popen(
-        [sys.executable, *arguments], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [sys.executable, *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        # A shell's background processes ignore it, and so do their children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     wait_for(lambda: list(folder.glob("iteration-1/*.labels/*/*.pt")) or list(folder.glob("iteration-1/*.pt")))
     everything = descendants(driver.pid)

@@ -135,7 +135,7 @@ def test_seeds():
     envs, other = make(num_envs=3), make(num_envs=3)
     assert_close(envs.reset(seed=4)[0], other.reset(seed=[4, 5, 6])[0])
     assert_close(envs.reset()[0], other.reset()[0])
-    one, two = make(num_envs=1), make(num_envs=1)
+    one, two = make(num_envs=100), make(num_envs=100)
     assert not np.array_equal(one.reset()[0]["belief"], two.reset()[0]["belief"])
     with pytest.raises(ValueError, match="seed must be one number, or 3 of them"):
         envs.reset(seed=[1, 2])

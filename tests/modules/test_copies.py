@@ -178,6 +178,18 @@ def test_copies_of_policies_are_simulated_by_compiled_loops_too():
     assert TruncatedRollout(make_problem("linear20").model, GREEDY).scalar is None, "another graph"
 
 
+@pytest.mark.parametrize("cost", [NEVER, SteadyStateCost(MODEL), PartitionedValue([NEVER] * 6)])
+def test_copies_of_closed_forms_are_closed_forms_too(cost):
+    """So that a label is the same to the last bit, whether or not a collector or a partition stands around it."""
+    pytest.importorskip("numba")
+    own, copied = (TruncatedRollout(MODEL, GREEDY, terminal_cost=each, max_steps=5) for each in (cost, copy.deepcopy(cost)))
+    assert own.scalar.closed
+    assert copied.scalar.closed
+    assert torch.equal(own(STATES, torch.arange(len(STATES))), copied(STATES, torch.arange(len(STATES))))
+    other = PartitionedValue([NEVER, *[NeverRepairCost(MODEL)] * 5])
+    assert not TruncatedRollout(MODEL, GREEDY, terminal_cost=other).scalar.closed
+
+
 def test_local_policies_are_replaced_by_others_that_read_more():
     network = PolicyNetwork(RelativeEncoder(MODEL), 3, generator=torch.Generator().manual_seed(0))
     policy, keys = PartitionedPolicy([GREEDY] * 6), torch.arange(4)

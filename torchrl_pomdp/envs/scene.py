@@ -95,7 +95,7 @@ def _texts(entries: dict[str, Tensor], stages: int) -> list[str]:
 def control_bars(model: BeliefModel, trajectory: TensorDictBase) -> list[list[tuple[str, float, bool]]] | None:
     """For every stage of a trajectory ``[T]`` the best controls and the chosen one: name, Q-factor, and whether it is chosen.
 
-    None where the trajectory has no ``q_factors``, or the model has more than 32 controls.
+    None where the trajectory has no ``q_factors`` of joint controls ``[T, U]``, or the model has more than 32 controls.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -105,10 +105,11 @@ def control_bars(model: BeliefModel, trajectory: TensorDictBase) -> list[list[tu
         >>> control_bars(make_problem("tiger").model, trajectory)
         [[('listen', 3.0, False), ('open right', 2.0, True)]]
     """
-    if "q_factors" not in trajectory or model.num_controls > MOST_CONTROLS:
+    q_factors = trajectory.get("q_factors", None)
+    if q_factors is None or q_factors.ndim != 2 or model.num_controls > MOST_CONTROLS:
         return None
     bars = []
-    for q, chosen in zip(trajectory["q_factors"].cpu(), trajectory["action"].tolist(), strict=True):
+    for q, chosen in zip(q_factors.cpu(), trajectory["action"].tolist(), strict=True):
         legal = torch.isfinite(q).nonzero().flatten()
         shown = sorted({chosen, *legal[q[legal].argsort(stable=True)][:_BEST].tolist()})
         names = [", ".join(model.shown_control(torch.tensor(u, device=model.device))) for u in shown]

@@ -86,9 +86,12 @@ def _truth(model: RepairModel, what: str, given: TensorDictBase) -> Tensor | Non
 def _bars(
     model: RepairModel, what: str, trajectory: TensorDictBase, action: Tensor
 ) -> list[list[tuple[str, float, bool]]] | None:
-    """The best controls of every stage; None where the trajectory has no Q-factors, or too many."""
-    if "q_factors" in trajectory:
-        check_tensor(f"q_factors of {what}", trajectory["q_factors"], (len(action), model.num_controls), finite=False)
+    """The best controls of every stage; None where the trajectory has no Q-factors of joint controls, or too many."""
+    q_factors = trajectory.get("q_factors", None)
+    if q_factors is not None and q_factors.ndim == 3:
+        check_tensor(f"q_factors of {what}", q_factors, (len(action), model.num_agents, model.num_agent_controls), finite=False)
+    elif q_factors is not None:
+        check_tensor(f"q_factors of {what}", q_factors, (len(action), model.num_controls), finite=False)
     stages = control_bars(model, trajectory)
     if stages is None:
         return None

@@ -17,6 +17,7 @@ from torchrl_pomdp.envs.digits import digits
 from torchrl_pomdp.envs.partition import SinglePart
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
+from torchrl_pomdp.modules.partitioned import PartitionedValue
 from torchrl_pomdp.modules.qfactors import check_q_factors
 from torchrl_pomdp.modules.repair.scalar.decisions import Decisions, decide
 from torchrl_pomdp.modules.repair.scalar.searches import History, repair_model
@@ -96,7 +97,7 @@ def repair_engine(
     # By content: a copy of a policy, such as a collector's, has a model of its own.
     if type(model) is not RepairModel or not torch.equal(own.graph.neighbours, model.graph.neighbours):
         return None
-    if not torch.equal(own.costs, model.costs):
+    if not _has_costs_of(own, model):
         return None
     rules = () if limits.truncation is None else limits.truncation.rules
     known = all(type(rule) in (AfterSteps, OnEntering, OnLeaving) for rule in rules)
@@ -323,7 +324,10 @@ class RepairEngine(ScalarEngine):
 
 def _closed_form(model: RepairModel, terminal_cost: Any) -> tuple[float, NDArray[np.float64]] | None:
     """A terminal cost as a constant and a cost for each level of each location; None where it is none of these."""
-    kind, nothing = type(terminal_cost), np.zeros((model.num_locations, 0))
+    nothing = np.zeros((model.num_locations, 0))
+    if type(terminal_cost) is PartitionedValue and len(set(terminal_cost.values)) == 1:
+        terminal_cost = terminal_cost.values[0]
+    kind = type(terminal_cost)
     if terminal_cost is None or kind is ZeroCost:
         return 0.0, nothing
     if kind is ConstantCost:
@@ -333,6 +337,10 @@ def _closed_form(model: RepairModel, terminal_cost: Any) -> tuple[float, NDArray
         # What does not fit, as it is of another model, is refused where tensors compute it.
         fits = costs.shape in ((model.num_levels,), (model.num_locations, model.num_levels))
         return (0.0, by_location(costs, model)) if fits else None
-    if kind is SteadyStateCost and terminal_cost.model is model:
+    if kind is SteadyStateCost and _has_costs_of(terminal_cost.model, model):
         return 0.0, by_location(model.costs, model) / (1.0 - model.discount)
     return None
+
+
+def _has_costs_of(one: RepairModel, other: RepairModel) -> bool:
+    return torch.equal(one.costs, other.costs) and one.discount == other.discount
