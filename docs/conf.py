@@ -18,14 +18,14 @@ project_copyright = author
 release = torchrl_pomdp.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-# Results and notebooks are pages too: Sphinx wants them below its own folder.
+# Results, benchmarks and notebooks are pages too: Sphinx wants them below its own folder.
 HERE = Path(__file__).parent
-for name in ("results", "tutorials"):
+for name in ("results", "tutorials", "benchmarks"):
     shutil.rmtree(HERE / name, ignore_errors=True)
     shutil.copytree(HERE.parent / name, HERE / name, ignore=shutil.ignore_patterns("*.py", "*.json"))
 # Tables that the pages of results show already.
 exclude_patterns = ["_build", "results/*/*-scale*.md", "results/compare/compare-*.md", "results/proposition1/proposition1.md"]
-exclude_patterns += ["results/changes/model-changes.md"]
+exclude_patterns += ["results/changes/model-changes.md", "results/asynchronous/linear20*.md"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb", ".rst": "restructuredtext"}
 
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
