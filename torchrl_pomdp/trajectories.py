@@ -38,16 +38,16 @@ def play(
     The noise is a function of key and stage: policies that are given the same states and keys start in the same hidden state
     and meet the same noise. Without a world, observations are drawn from :math:`\hat p(z\mid b_y,u)`.
 
-    ================= ============= =================================================================
-    key               shape         meaning
-    ================= ============= =================================================================
-    core and derived  ``[*B, T, …]``  the feature states :math:`y_k`
-    action            ``[*B, T]``   the controls :math:`u_k`
-    q_factors         ``[*B, T, U]``  if the policy writes them, as rollout does
-    cost              ``[*B, T]``   :math:`\hat g(y_k,u_k)`, 0 from a terminal state on
-    hidden            ``[*B, T, …]``  the hidden states, if the model has a world
-    next              ``[*B, T, …]``  core entries, and hidden states, after the stage
-    ================= ============= =================================================================
+    ================ ============== ===================================================
+    key              shape          meaning
+    ================ ============== ===================================================
+    core and derived ``[*B, T, …]`` the feature states :math:`y_k`
+    action           ``[*B, T]``    the controls :math:`u_k`
+    q_factors        ``[*B, T, U]`` if the policy writes them, as rollout does
+    cost             ``[*B, T]``    :math:`\hat g(y_k,u_k)`, 0 from a terminal state on
+    hidden           ``[*B, T, …]`` the hidden states, if the model has a world
+    next             ``[*B, T, …]`` core entries, and hidden states, after the stage
+    ================ ============== ===================================================
 
     Args:
         model: the belief model.
