@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import astuple, replace
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
@@ -37,20 +37,21 @@ def scaling(table: Table) -> None:
     from torchrl_pomdp.distributed import RayWorkers
 
     real: dict[int, list[tuple[float, float]]] = {0: [], 1: [], 2: []}
+    measured: list[Costs] = []
     with threads(1), patch.object(labels, "_BLOCK", 8 * BLOCK):
         for repeat, count in enumerate((1, 2, 1, 2)):
             with RayWorkers(num_workers=count) as workers:
                 # Processes start, and compiled loops are read.
                 _step(workers, BLOCK)
                 real[count].append(_step(workers))
-                if repeat == 3:
-                    costs = _measure(workers, table)
+                measured.append(_measure(workers, table if repeat == 3 else Table()))
             if count == 1:
                 real[0].append(_step(LOCAL))
         # The least counts: what others do on the machine only slows it down.
         least = {
             count: (min(labelled for labelled, _ in steps), min(whole for _, whole in steps)) for count, steps in real.items()
         }
+        costs = Costs(*(min(values) for values in zip(*map(astuple, measured), strict=True)))
         _compare(least, least.pop(0), costs, table)
     _extrapolate(costs, table)
 
