@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import torch
 from tensordict import TensorDictBase
 
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
+from torchrl_pomdp.envs.repair.rendering.figures import network_figure
+from torchrl_pomdp.envs.repair.rendering.network import edges_of, places_of
+from torchrl_pomdp.envs.repair.rendering.played import expected_damage
 from torchrl_pomdp.envs.scene import Scene, rounded
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ class NetworkScene(Scene):
         model: the repair model.
 
     Examples:
+        >>> import torch
         >>> from torchrl_pomdp.problems import make_problem
         >>> from torchrl_pomdp.trajectories import play
         >>> problem, key = make_problem("line3"), torch.tensor(1)
@@ -38,12 +41,10 @@ class NetworkScene(Scene):
     def layout(self) -> dict[str, Any]:
         """Places, edges, names and the largest level."""
         graph = self.model.graph
-        nodes, slots = (graph.neighbours > torch.arange(graph.num_locations).unsqueeze(-1)).nonzero(as_tuple=True)
-        ends = torch.stack([nodes, graph.neighbours[nodes, slots]], -1)
         return {
             "kind": "network",
-            "places": rounded(torch.stack([graph.columns, graph.rows], -1)),
-            "edges": ends.unique(dim=0).tolist(),
+            "places": rounded(places_of(graph)),
+            "edges": edges_of(graph).unique(dim=0).tolist(),
             "names": list(graph.location_names),
             "levels": self.model.num_levels - 1,
         }
@@ -51,7 +52,6 @@ class NetworkScene(Scene):
     def frames(self, trajectory: TensorDictBase) -> list[dict[str, Any]]:
         """Expected damage, true levels, where the robots are, where they go, -1 for repair."""
         model, location = self.model, trajectory["location"]
-        levels = torch.arange(model.num_levels, dtype=model.dtype, device=model.device)
         controls = model.split_controls(trajectory["action"])
         to = model.destinations[location, controls].masked_fill(controls == REPAIR, -1).tolist()
         hidden = trajectory.get("hidden", None)
@@ -59,14 +59,12 @@ class NetworkScene(Scene):
         return [
             {"does": self._does(robots, ways), "damage": damage, "truth": true, "robots": robots, "to": ways}
             for damage, true, robots, ways in zip(
-                rounded(trajectory["belief"] @ levels), truth, location.tolist(), to, strict=True
+                rounded(expected_damage(model, trajectory["belief"])), truth, location.tolist(), to, strict=True
             )
         ]
 
     def figure(self, y: TensorDictBase, title: str = "") -> Figure:
         """The feature state on the graph, see :func:`~torchrl_pomdp.envs.repair.network_figure`."""
-        from torchrl_pomdp.envs.repair.rendering import network_figure
-
         return network_figure(self.model, y, title=title)
 
     def _does(self, robots: list[int], to: list[int]) -> str:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchrl_pomdp.envs.repair.graphs import Graph
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Normalize
 
-__all__ = ["DAMAGE", "DAMAGE_LABEL", "ROBOT", "Scale", "damage_norm", "draw_network", "scale_of"]
+__all__ = ["DAMAGE", "DAMAGE_LABEL", "ROBOT", "Scale", "damage_norm", "draw_network", "edges_of", "places_of", "scale_of"]
 
 # Colours of damage, whose lightness falls all the way, and of what robots do.
 DAMAGE, ROBOT, _EDGE = "YlOrRd", "#1f4e79", "#8a8f98"
@@ -37,9 +38,8 @@ def draw_network(axes: Axes, model: RepairModel, damage: Tensor, location: Tenso
 
     graph = model.graph
     scale = scale_of(model)
-    places = torch.stack([graph.columns, graph.rows], -1)
-    nodes, slots = (graph.neighbours > torch.arange(graph.num_locations).unsqueeze(-1)).nonzero(as_tuple=True)
-    ends = torch.stack([places[nodes], places[graph.neighbours[nodes, slots]]], 1)
+    places = places_of(graph)
+    ends = places[edges_of(graph)]
     axes.add_collection(LineCollection(list(ends.numpy()), colors=_EDGE, linewidths=1.2, zorder=1))
     _add_discs(
         axes,
@@ -83,7 +83,7 @@ def _write_names(axes: Axes, model: RepairModel, damage: Tensor, below: float) -
 
 def _draw_robots(axes: Axes, model: RepairModel, scale: Scale, location: Tensor, controls: Tensor | None) -> None:
     """Numbered discs around the robots' locations; where there are controls, a plus beside or an arrow from each."""
-    places = torch.stack([model.graph.columns, model.graph.rows], -1)
+    places = places_of(model.graph)
     here, disc = places[location], _DISC * scale.unit
     there = here if controls is None else places[model.destinations.cpu()[location, controls]]
     outwards, distance = _ring(location, there - here, scale.place, disc)
@@ -131,6 +131,17 @@ def _ring(location: Tensor, ways: Tensor, place: float, disc: float) -> tuple[Te
     return torch.stack([angle.cos(), angle.sin()], -1), apart.unsqueeze(-1)
 
 
+def places_of(graph: Graph) -> Tensor:
+    """Column and row of each location, ``[L, 2]``."""
+    return torch.stack([graph.columns, graph.rows], -1)
+
+
+def edges_of(graph: Graph) -> Tensor:
+    """Both ends of each edge, the smaller number first, int64 ``[E, 2]``."""
+    nodes, slots = (graph.neighbours > torch.arange(graph.num_locations).unsqueeze(-1)).nonzero(as_tuple=True)
+    return torch.stack([nodes, graph.neighbours[nodes, slots]], -1)
+
+
 class Scale(NamedTuple):
     """How a graph comes to paper.
 
@@ -151,7 +162,7 @@ def scale_of(model: RepairModel) -> Scale:
     """The scale at which neighbours are well apart, in a picture that is not too large."""
     graph = model.graph
     nodes, slots = (graph.neighbours >= 0).nonzero(as_tuple=True)
-    places = torch.stack([graph.columns, graph.rows], -1)
+    places = places_of(graph)
     lengths = (places[nodes] - places[graph.neighbours[nodes, slots]]).norm(dim=-1)
     typical = float(lengths.median()) if len(lengths) else 1.0
     low, high = places.amin(0), places.amax(0)
