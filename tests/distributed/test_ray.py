@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -15,7 +17,6 @@ from pathlib import Path
 import pytest
 import torch
 from _tiger import CONFIG, TWICE, assert_same, carried_out, tiger
-from ray.exceptions import OutOfMemoryError
 from torchrl.collectors.distributed import RayCollector
 
 from torchrl_pomdp import evaluation
@@ -236,13 +237,34 @@ def test_errors_say_which_work_has_failed(cluster, small, monkeypatch):
         carried_out(cluster, base=broken, config=config)
 
 
-def test_memory_that_runs_out_is_named(cluster, monkeypatch):
-    def out(reference):
-        raise OutOfMemoryError("a worker was killed")
+class Sleeps:
+    """A training that would not end."""
 
-    monkeypatch.setattr(ray_workers.ray, "get", out)
-    with pytest.raises(WorkerError, match=r"the work: OutOfMemoryError: .*a worker was killed"):
-        cluster._get(None, "the work")
+    part, name = 3, "iteration-1/1-improve, part 3"
+
+    def open(self):
+        time.sleep(100)
+
+
+def out_of_memory():
+    """On a machine that lacks memory from the beginning."""
+    ray_workers._RETRIES = 1
+    with RayWorkers(num_workers=1) as workers:
+        for work in (
+            lambda: list(workers.tasks(lambda shared, item: time.sleep(100), None, [7], lambda item: f"number {item}")),
+            lambda: workers.trained({3: workers.training(Sleeps(), None, False)}),
+        ):
+            with pytest.raises(WorkerError, match="OutOfMemoryError") as error:
+                work()
+            sys.stdout.write(f"failed: {str(error.value)[:60]}\n")
+
+
+def test_memory_that_runs_out_is_named():
+    """Ray would begin such tasks again without end."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "RAY_memory_usage_threshold": "0.01"}
+    program = [sys.executable, "-c", "import test_ray; test_ray.out_of_memory()"]
+    found = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=300)
+    assert re.findall(r"failed: (.*): OutOfMemoryError", found.stdout) == ["number 7", f"train {Sleeps.name}"], found.stderr
 
 
 def test_a_worker_that_dies_again_and_again_is_given_up(cluster):
@@ -272,6 +294,15 @@ def test_a_running_cluster_has_the_workers_that_it_has(cluster):
     with pytest.raises(ValueError, match="num_workers is for a cluster that is started here, got 2 for one that is running"):
         RayWorkers(num_workers=2)
     assert list(cluster.tasks(lambda shared, item: (item, item), None, [1], str)), "the cluster is still there"
+
+
+def test_a_cluster_that_is_not_there_is_named_at_once():
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{unused.getsockname()[1]}"
+        program = f"from torchrl_pomdp.distributed import RayWorkers; RayWorkers({address!r})"
+        found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100)
+    assert f"ConnectionError: nothing answers at {address}: " in found.stderr
 
 
 def test_models_elsewhere_are_refused(cluster):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -16,6 +17,7 @@ from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import AsynchronousIteration, PolicyIterationConfig, asynchronous, papi_nt, papi_t
 from torchrl_pomdp.trainers.run import TrainingRun
+from torchrl_pomdp.workers import LocalWorkers
 
 CONFIG = PolicyIterationConfig(
     iterations=2, samples_per_part=60, value_samples=40, validation_states=60, epochs=1, least_steps=10
@@ -166,3 +168,23 @@ def test_a_training_run(line3, tmp_path):
     assert run.carry_out(tmp_path / "run") == first
     with pytest.raises(ValueError, match="staleness"):
         replace(run, staleness=None).carry_out(tmp_path / "run")
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_no_more_parts_train_at_once_than_there_are_workers(line3, count):
+    running, most = [], []
+
+    class Counting(LocalWorkers):
+        num_workers = count
+
+        def trained(self, trainings):
+            running.append(trainings)
+            most.append(len(running))
+            time.sleep(0.05)
+            try:
+                return super().trained(trainings)
+            finally:
+                running.remove(trainings)
+
+    list(asynchronously(line3, workers=Counting()))
+    assert max(most) == count

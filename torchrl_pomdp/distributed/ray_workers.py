@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
@@ -23,6 +25,8 @@ _AHEAD = 2
 # How often a task or a training whose process dies is done again: with the same seeds, so that nothing changes.
 _RETRIES = 5
 _LOOPBACK = "127.0.0.1"
+# Seconds within which a cluster must answer.
+_ANSWER = 10.0
 
 
 class RayWorkers(Workers):
@@ -62,11 +66,13 @@ class RayWorkers(Workers):
         # Reports of tasks that were given out and not collected yet.
         self._given: set[Any] = set()
         self._do: Any = ray.remote(num_returns=2, num_cpus=1, max_retries=_RETRIES)(_do)
+        # Otherwise a task that needs too much memory is begun again without end.
+        os.environ.setdefault("RAY_task_oom_retries", str(_RETRIES))
         try:
             if self._own and address is None:
                 ray.init("local", num_cpus=wanted, include_dashboard=False, log_to_driver=False, _node_ip_address=_LOOPBACK)
-            elif self._own:
-                ray.init(address, log_to_driver=False)
+            elif self._own and address is not None:
+                _connect(address)
             self.num_workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
         except BaseException:
             self.close()
@@ -156,6 +162,21 @@ class RayWorkers(Workers):
             raise WorkerError(f"{name}: {type(cause).__name__}: {cause}") from error
         except RayError as error:
             raise WorkerError(f"{name}: {type(error).__name__}: {error}") from error
+
+
+def _connect(address: str) -> None:
+    """Connect to a running cluster; Ray itself would try for ten minutes."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdigit() and "/" not in host:
+        try:
+            socket.create_connection((host, int(port)), _ANSWER).close()
+        except (OSError, OverflowError) as error:
+            raise ConnectionError(f"nothing answers at {address}: {error}; ray start --head starts a cluster") from error
+    try:
+        ray.init(address, log_to_driver=False)
+    except ConnectionError as error:
+        token = "where the cluster has a token, set RAY_AUTH_MODE=token here too, and have the same ~/.ray/auth_token"
+        raise ConnectionError(f"{error}; {token}") from error
 
 
 class RayTraining(Training):

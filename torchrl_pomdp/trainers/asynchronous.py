@@ -150,6 +150,8 @@ class AsynchronousIteration:
         self.best = iteration.best
         self.published: list[Version] = []
         self._changed = threading.Condition()
+        # No more parts train at once than where they do not go at their own pace.
+        self._trainers = threading.BoundedSemaphore(iteration.workers.num_workers)
 
     def _start(self) -> _Progress:
         run = self.run
@@ -259,7 +261,10 @@ class AsynchronousIteration:
                     training.add(part, block.handle)
             for other, block in state.images(part, number, index):
                 training.add(other, block.handle)
-            trained = run.workers.trained({part: training})[part]
+            with self._trainers:
+                if state.stopped:
+                    return None
+                trained = run.workers.trained({part: training})[part]
             network.load_state_dict(trained.weights)
             (local if isinstance(step, Improve) else values)[part] = network.eval()
             records[name] = PartRecord.of(collector, trained)
