@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import astuple, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
@@ -36,24 +36,32 @@ def scaling(table: Table) -> None:
     """Labels of a network's rollout (2 trajectories) and training of three parts on Ray, one thread a worker."""
     from torchrl_pomdp.distributed import RayWorkers
 
-    real: dict[int, list[tuple[float, float]]] = {0: [], 1: [], 2: []}
+    runs: dict[int, list[_Run]] = {0: [], 1: [], 2: []}
     measured: list[Costs] = []
     with threads(1), patch.object(labels, "_BLOCK", 8 * BLOCK):
         for repeat, count in enumerate((1, 2, 1, 2)):
             with RayWorkers(num_workers=count) as workers:
                 # Processes start, and compiled loops are read.
                 _step(workers, BLOCK)
-                real[count].append(_step(workers))
+                runs[count].append(_step(workers))
                 measured.append(_measure(workers, table if repeat == 3 else Table()))
             if count == 1:
-                real[0].append(_step(LOCAL))
+                runs[0].append(_step(LOCAL))
         # The least counts: what others do on the machine only slows it down.
-        least = {
-            count: (min(labelled for labelled, _ in steps), min(whole for _, whole in steps)) for count, steps in real.items()
-        }
+        least = {count: min(own, key=lambda run: run.whole) for count, own in runs.items()}
         costs = Costs(*(min(values) for values in zip(*map(astuple, measured), strict=True)))
-        _compare(least, least.pop(0), costs, table)
+        costs = _compare(least, costs, table)
     _extrapolate(costs, table)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Seconds of a real step: until its labels are there, in all, of a block of labels, and of an optimisation step."""
+
+    labelled: float
+    whole: float
+    compute: float
+    step: float
 
 
 def _collectors(states: int = STATES) -> dict[int, RolloutImprovement]:
@@ -70,23 +78,26 @@ def _collectors(states: int = STATES) -> dict[int, RolloutImprovement]:
     }
 
 
-def _step(workers: Workers, states: int = STATES) -> tuple[float, float]:
-    """Seconds until the labels of a step are there, and until it is done."""
+def _step(workers: Workers, states: int = STATES) -> _Run:
+    """Carry out a step."""
     images = PartImages(linear20().partition, linear20().symmetries)
     begin = time.perf_counter()
     trainings = {}
     for part in range(PARTS):
         job = PartJob(part, f"part {part}", part, networks().policies[part], ClassificationLoss, images, CONFIG)
         trainings[part] = workers.training(job, None, False)
-    blocks = {part: collector.blocks(workers, images.counts) for part, collector in _collectors(states).items()}
+    collectors = _collectors(states)
+    blocks = {part: collector.blocks(workers, images.counts) for part, collector in collectors.items()}
     for part, own in blocks.items():
         for block in own:
             for other, training in trainings.items():
                 if block.summary[other]:
                     training.add(part, block.handle)
     labelled = time.perf_counter() - begin
-    workers.trained(trainings)
-    return labelled, time.perf_counter() - begin
+    trained = workers.trained(trainings)
+    whole = time.perf_counter() - begin
+    compute = sum(collector.seconds for collector in collectors.values()) * BLOCK / (PARTS * states)
+    return _Run(labelled, whole, compute, sum(own.seconds for own in trained.values()) / (PARTS * CONFIG.least_steps))
 
 
 def _nothing(shared: object, item: object) -> tuple[None, None]:
@@ -137,15 +148,24 @@ def _reach(ray):
     return ray.remote(read)
 
 
-def _compare(real: dict[int, tuple[float, float]], local: tuple[float, float], costs: Costs, table: Table) -> None:
-    """Real steps beside simulated ones, and beside those of one process."""
-    blocks, steps = -(-STATES // BLOCK), CONFIG.least_steps
-    for count, (_, whole) in real.items():
-        found, name = simulate(costs, count, PARTS, blocks, steps), f"{count} worker{'s' if count > 1 else ''}"
-        table.add(f"a step, {name}", whole, "s")
-        table.add(f"the same, simulated over measured, {name}", found.seconds / whole, "ratio", "0.85 … 1.15")
-    table.add("labelling throughput, two workers over one", real[1][0] / real[2][0], "ratio", ">= 1.7")
-    table.add("time of a step, one worker over one process with one thread", real[1][1] / local[1], "ratio", "<= 1.10")
+def _compare(runs: dict[int, _Run], costs: Costs, table: Table) -> Costs:
+    """Real steps beside simulated ones, and beside those of one process; the costs when both cores are busy.
+
+    A machine's speed changes from minute to minute, so the workers' own costs are those of the step itself.
+    """
+    blocks = -(-STATES // BLOCK)
+    for count, run in runs.items():
+        name = f"{count} worker{'s' if count > 1 else ''}" if count else "one process"
+        table.add(f"a step, {name}", run.whole, "s")
+        table.add(f"a block of labels in it, {name}", run.compute, "s")
+        table.add(f"an optimisation step in it, {name}", 1e3 * run.step, "ms")
+        if count:
+            costs = replace(costs, compute=run.compute, step=run.step)
+            found = simulate(costs, count, PARTS, blocks, CONFIG.least_steps)
+            table.add(f"a step, simulated over measured, {name}", found.seconds / run.whole, "ratio", "0.85 … 1.15")
+    table.add("labelling throughput, two workers over one", runs[1].labelled / runs[2].labelled, "ratio", ">= 1.7")
+    table.add("time of a step, one worker over one process with one thread", runs[1].whole / runs[0].whole, "ratio", "<= 1.10")
+    return costs
 
 
 def _extrapolate(costs: Costs, table: Table) -> None:
