@@ -9,7 +9,6 @@ from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
-from unittest.mock import patch
 
 import torch
 
@@ -25,8 +24,8 @@ from torchrl_pomdp.trainers import make_networks
 from torchrl_pomdp.trainers.parts import PartImages, PartJob
 from torchrl_pomdp.workers import LOCAL, Workers
 
-# A step of the startgame of linear20: its parts, and the labelled states of each.
-PARTS, STATES, BLOCK = 3, 15_360, 256
+# A step of the startgame of linear20: its parts, the labelled states of each, and those of a task.
+PARTS, STATES, BLOCK = 3, 16_384, 2048
 CONFIG = PolicyIterationConfig(samples_per_part=STATES, epochs=1, least_steps=600)
 # Of a cluster: 10 Gbit/s into each machine.
 BANDWIDTH = 1.25e9
@@ -38,7 +37,7 @@ def scaling(table: Table) -> None:
 
     runs: dict[int, list[_Run]] = {0: [], 1: [], 2: []}
     measured: list[Costs] = []
-    with threads(1), patch.object(labels, "_BLOCK", 8 * BLOCK):
+    with threads(1):
         for repeat, count in enumerate((1, 2, 1, 2)):
             with RayWorkers(num_workers=count) as workers:
                 # Processes start, and compiled loops are read.
@@ -170,9 +169,8 @@ def _compare(runs: dict[int, _Run], costs: Costs, table: Table) -> Costs:
 
 def _extrapolate(costs: Costs, table: Table) -> None:
     """Steps of the paper's size on clusters: 200 000 labelled states for each part, six epochs; half the parts in a step."""
-    blocks, steps, scale = -(-200_000 // 2048), 6 * 2 * 200_000 // 256, 2048 / BLOCK
-    # Blocks of the usual size.
-    wide = replace(costs, compute=scale * costs.compute, add=scale * costs.add, block=scale * costs.block, bandwidth=BANDWIDTH)
+    blocks, steps = -(-200_000 // BLOCK), 6 * 2 * 200_000 // 256
+    wide = replace(costs, bandwidth=BANDWIDTH)
     curves = {}
     for parts in (6, 60, 1000):
         one = simulate(wide, 1, parts // 2, blocks, steps)

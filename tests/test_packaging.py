@@ -49,10 +49,10 @@ def test_a_wheel_works_without_the_source_tree(folder, tmp_path):
     assert {name.split("/")[0] for name in names} == {"torchrl_pomdp", f"torchrl_pomdp-{metadata['Version']}.dist-info"}
     source = {path.relative_to(ROOT).as_posix() for path in (ROOT / "torchrl_pomdp").rglob("*") if path.is_file()}
     assert {name for name in source if "__pycache__" not in name} == {name for name in names if "dist-info" not in name}
-    run = "import torchrl_pomdp.cli as cli; print(cli.__file__); cli.main(['evaluate', 'greedy', *'{}'.split()])"
-    found = python("-c", run.format("--problem line3 --states 20"), cwd=tmp_path, path=tmp_path / "site")
+    run = "import torchrl_pomdp.cli as cli; print(cli.__file__); cli.main(['evaluate', 'listen', *'{}'.split()])"
+    found = python("-c", run.format("--problem tiger --states 20"), cwd=tmp_path, path=tmp_path / "site")
     assert found.splitlines()[0] == str(tmp_path / "site/torchrl_pomdp/cli.py")
-    assert "| urgency |" in found
+    assert "| listen |" in found
 
 
 def test_an_sdist_has_all_that_the_tests_need(folder):

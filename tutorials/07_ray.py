@@ -33,6 +33,7 @@
 WORKERS = 2
 ITERATIONS = 2
 SAMPLES_PER_PART = 300
+STAGES = 100
 OPTIMIZATION_STEPS = 200
 EVALUATION_STATES = 500
 
@@ -78,6 +79,7 @@ config = PolicyIterationConfig(
     iterations=ITERATIONS,
     samples_per_part=SAMPLES_PER_PART,
     trajectories=4,
+    max_steps=STAGES,
     least_steps=OPTIMIZATION_STEPS,
     epochs=1,
     hidden=(64, 32),

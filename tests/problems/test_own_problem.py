@@ -186,7 +186,7 @@ def test_the_command_trains_and_evaluates_it_in_fresh_processes(tmp_path):
         "--hidden",
         "16",
         "--max-steps",
-        "30",
+        "8",
         "--online-states",
         "0",
     ]
