@@ -15,12 +15,13 @@ __all__ = ["small_run"]
 def small_run(folder: Path, problem: str | Problem = "line3", **options: Any) -> Path:
     numbers: dict[str, Any] = {
         "samples_per_part": 40,
+        "value_samples": 30,
         "trajectories": 1,
         "least_steps": 1,
-        "validation_states": 50,
         "max_steps": 20,
     }
-    config = PolicyIterationConfig(2, **numbers, value_samples=30, visits_per_label=0.2, hidden=(8,), value_hidden=(8,))
+    numbers |= {"validation_states": 50, "visits_per_label": 0.2, "hidden": (8,), "value_hidden": (8,)}
+    config = PolicyIterationConfig(2, **numbers)
     given = make_problem(problem) if isinstance(problem, str) else problem
     TrainingRun(given, config=config, states=20, online_states=0, **options).carry_out(folder)
     return folder

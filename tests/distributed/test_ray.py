@@ -141,20 +141,7 @@ def test_a_killed_actor_changes_nothing(cluster, small):
 
 SCRIPT = "import sys, test_ray; test_ray.on_a_cluster_of_its_own(sys.argv[1])"
 COMMAND = ("-m", "torchrl_pomdp.cli", "train", "tiger", "--states", "20", "--validation-states", "50", "--backend", "ray")
-NUMBERS = (
-    "--samples-per-part",
-    "300",
-    "--iterations",
-    "2",
-    "--least-steps",
-    "300",
-    "--epochs",
-    "1",
-    "--workers",
-    "2",
-    "--max-steps",
-    "12",
-)
+SIZE = ("--samples-per-part", "300", "--iterations", "2", "--least-steps", "300", "--epochs", "1", "--max-steps", "12")
 
 
 def on_a_cluster_of_its_own(folder):
@@ -229,7 +216,7 @@ def test_a_killed_driver_goes_on(cluster, tmp_path):
 
 def test_an_interrupt_of_the_command_releases_ray(tmp_path):
     folder = tmp_path / "run"
-    interrupted((*COMMAND, *NUMBERS, "--out", str(folder)), folder, signal.SIGINT)
+    interrupted((*COMMAND, *SIZE, "--workers", "2", "--out", str(folder)), folder, signal.SIGINT)
 
 
 # ---- what fails ------------------------------------------------------------------------------------------------------
