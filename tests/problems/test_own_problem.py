@@ -172,28 +172,12 @@ def test_the_command_trains_and_evaluates_it_in_fresh_processes(tmp_path):
         assert done.returncode == 0, done.stderr
         return done.stdout + done.stderr
 
-    numbers = [
-        "--iterations",
-        "1",
-        "--samples-per-part",
-        "200",
-        "--least-steps",
-        "150",
-        "--states",
-        "60",
-        "--validation-states",
-        "60",
-        "--hidden",
-        "16",
-        "--max-steps",
-        "8",
-        "--online-states",
-        "0",
-    ]
+    numbers = ["--iterations", "1", "--samples-per-part", "100", "--least-steps", "50", "--hidden", "16", "--max-steps", "8"]
+    numbers += ["--states", "8", "--validation-states", "8", "--online-states", "0"]
     told = command("train", "own_machine:problem", "--out", "run", *numbers)
     assert "threshold: 1.000 of threshold" in told
-    assert "machine: TabularModel: 10 states, 4 controls, 3 observations, discount 0.9; 60 start states" in command(
-        "evaluate", "run/best.pt", "--problem", "own_machine:problem", "--states", "60"
+    assert "machine: TabularModel: 10 states, 4 controls, 3 observations, discount 0.9; 8 start states" in command(
+        "evaluate", "run/best.pt", "--problem", "own_machine:problem", "--states", "8"
     )
 
 
