@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,14 @@ def _block(translator: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+def _beside(app: Sphinx, page: str, source: list[str]) -> None:
+    """Pages link results and tutorials where they are in the repository; for Sphinx they lie beside its own pages."""
+    up = "../" * page.count("/")
+    if not page.startswith(("results/", "tutorials/", "benchmarks/")):
+        source[0] = re.sub(rf"\]\({re.escape(up)}\.\./(results|tutorials)/", rf"]({up}\1/", source[0])
+
+
 def setup(app: Sphinx) -> None:
     """Formulas become MathML, which browsers draw without any script from elsewhere."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))
+    app.connect("source-read", _beside)

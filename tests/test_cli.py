@@ -100,7 +100,7 @@ def test_a_run_folder_of_another_run_is_left_alone(tmp_path, capsys):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("precious")
     assert main(["train", "line3", "--out", str(tmp_path / "mine")]) == 2
-    assert "is in use" in capsys.readouterr().err
+    assert "holds other files" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("policy", ["greedy", "urgency"])
@@ -196,7 +196,7 @@ def test_without_matplotlib_the_table_is_printed(tmp_path, monkeypatch, capsys):
     assert main(["train", "line3", "--algorithm", "API", *TINY.split(), "--out", str(tmp_path / "run")]) == 0
     text = capsys.readouterr().out
     assert "| API 1 |" in text
-    assert "no pictures: pictures need matplotlib: pip install 'torchrl-pomdp[plot]'" in text.splitlines()
+    assert "no pictures: pictures need matplotlib: pip install '.[plot]' in the library's folder" in text.splitlines()
     assert not list(tmp_path.rglob("*.png"))
 
 

@@ -92,8 +92,11 @@ def test_a_long_compilation_is_announced_and_a_short_one_is_not(caplog, monkeypa
         assert entry(outer(lambda x: x + 2), 1.5)(1.5) == 3.5
         assert not caplog.records
         monkeypatch.setattr(compiling, "_SOON", 0.0)
-        assert entry(outer(slow), 1.0)(1.0) == 2.0
-    assert [record.getMessage() for record in caplog.records] == ["compiling simulations, once: up to 20 seconds"]
+        monkeypatch.setattr(compiling, "_announced", [])
+        for _ in range(2):
+            assert entry(outer(slow), 1.0)(1.0) == 2.0
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert told.startswith("preparing compiled simulations: the first time up to 20 seconds")
 
 
 def test_where_nothing_can_be_written_every_process_compiles(monkeypatch):

@@ -97,7 +97,7 @@ def _workers(command: Train) -> AbstractContextManager[Workers]:
                 raise ValueError(f"{name} is for --backend ray, got {getattr(command, name)} for the backend local")
         return nullcontext(LOCAL)
     if find_spec("ray") is None:
-        raise ValueError("backend ray needs Ray: pip install 'torchrl-pomdp[ray]'")
+        raise ValueError("backend ray needs Ray: pip install '.[ray]' in the library's folder")
     from torchrl_pomdp.distributed import RayWorkers
 
     return RayWorkers(command.address, command.workers)
@@ -136,7 +136,7 @@ def evaluate(command: Evaluate) -> None:
             problem.start,
             num_states=command.states,
             seed=command.seed,
-            terminal_cost=problem.pessimistic_cost,
+            terminal_cost=problem.evaluation_cost,
             progress=True,
             name=f"evaluate {name}",
         )

@@ -57,7 +57,7 @@ class Comparison:
         cost: discounted cost of the policy.
         difference: policy minus baseline.
         ratio: mean cost over the baseline's mean cost, its standard error by the delta method. None where it means nothing:
-            the baseline's mean is not positive, or, with costs of both signs, not clearly so.
+            the mean cost is negative, or the baseline's is not positive, or, with costs of both signs, not clearly so.
     """
 
     cost: Estimate
@@ -191,8 +191,7 @@ def estimate(values: Tensor) -> Estimate:
 def compare(costs: Tensor, baseline: Tensor) -> Comparison:
     """Compare paired costs ``[N]`` with a baseline's ``[N]``.
 
-    The difference always means something. A ratio does so where the baseline's mean is a positive cost; see
-    :class:`Comparison`.
+    The difference always means something. A ratio does so where both means are costs, not rewards; see :class:`Comparison`.
 
     Raises:
         TypeError: if they are no tensors of real numbers.
@@ -211,7 +210,7 @@ def compare(costs: Tensor, baseline: Tensor) -> Comparison:
     return Comparison(
         cost=estimate(costs),
         difference=estimate(costs - baseline),
-        ratio=_ratio(costs, baseline) if _is_positive(baseline) else None,
+        ratio=_ratio(costs, baseline) if _is_positive(baseline) and costs.mean() >= 0.0 else None,
     )
 
 

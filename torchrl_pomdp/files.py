@@ -36,6 +36,8 @@ __all__ = [
 
 # Larger text files are no problems that anyone has written.
 _MOST_BYTES = 1 << 27
+# So many differences inside of an entry are named one by one.
+_FEW = 4
 
 
 class DamagedFileError(ValueError):
@@ -212,11 +214,21 @@ def claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
     if not path.is_file() and _write_new(path, _json("identity", given).encode()):
         return
     found = read_json(path)
-    nothing = object()
-    differing = sorted(key for key in {*found, *given} if found.get(key, nothing) != given.get(key, nothing))
+    differing = _differing(found, given)
     if differing:
         what = ", ".join(differing)
         raise ValueError(f"run folder {path.parent} holds another run, which differs in {what}: name another folder")
+
+
+def _differing(found: dict[str, Any], given: dict[str, Any]) -> list[str]:
+    """Names of the entries that differ, those inside of an entry after a dot if they are few."""
+    nothing, names = object(), []
+    for key in sorted({*found, *given}):
+        one, other = found.get(key, nothing), given.get(key, nothing)
+        inside = _differing(one, other) if isinstance(one, dict) and isinstance(other, dict) else []
+        if one != other:
+            names += [f"{key}.{name}" for name in inside] if 0 < len(inside) <= _FEW else [key]
+    return names
 
 
 def _write_new(path: Path, content: bytes) -> bool:

@@ -18,5 +18,5 @@ def new_figure(width: float, height: float) -> Figure:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install 'torchrl-pomdp[plot]'") from error
+        raise ImportError("pictures need matplotlib: pip install '.[plot]' in the library's folder") from error
     return Figure(figsize=(width, height), layout="constrained", dpi=120)

@@ -481,9 +481,8 @@ figure
 
 # %%
 folder = Path(tempfile.mkdtemp())
-save_checkpoint(
-    folder / "pumps.pt", Checkpoint(problem, config, "pAPI-NT", iterations[-1].number, trained, iterations[-1].value)
-)
+best = max([iteration.number for iteration in iterations if iteration.accepted], default=0)  # 0: the base policy
+save_checkpoint(folder / "pumps.pt", Checkpoint(problem, config, "pAPI-NT", best, trained, iterations[-1].value))
 controller = Controller.from_checkpoint(folder / "pumps.pt", problem=problem)
 controller.reset(all_new(torch.tensor(0)))
 print("first control:", controller.act().names)

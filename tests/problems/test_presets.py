@@ -53,7 +53,7 @@ def test_training_states_lie_in_their_parts_and_starts_are_startgame(name):
 
 
 def test_unknown_presets_are_refused():
-    with pytest.raises(ValueError, match="unknown preset 'line4'; known presets: crying_baby, grid5x4"):
+    with pytest.raises(ValueError, match="unknown preset 'line4'; do you mean line3\\?; known presets: crying_baby, grid5x4"):
         make_problem("line4")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
     from torchrl_pomdp.envs.belief_model import BeliefModel
 
-__all__ = ["MOST_CONTROLS", "Scene", "control_bars", "rounded"]
+__all__ = ["MOST_CONTROLS", "Scene", "StatesScene", "control_bars", "rounded"]
 
 MOST_CONTROLS = 32
 """Models with more controls have no bars of Q-factors: their names are too long."""
@@ -39,9 +40,9 @@ class Scene:
         >>> problem, key = make_problem("tiger"), torch.tensor(1)
         >>> scene = problem.model.scene()
         >>> scene.layout()
-        {'kind': 'bars', 'bars': ['belief 0', 'belief 1'], 'more': 0}
+        {'kind': 'bars', 'bars': ['tiger left', 'tiger right'], 'more': 0}
         >>> scene.frames(play(problem.model, problem.base_policies["listen"], problem.start(key), key, max_steps=1))
-        [{'does': 'listen', 'bars': [0.5, 0.5], 'text': '', 'truth': 'state 1'}]
+        [{'does': 'listen', 'bars': [0.5, 0.5], 'text': '', 'truth': 'tiger right'}]
     """
 
     def __init__(self, model: BeliefModel) -> None:
@@ -75,6 +76,29 @@ class Scene:
     def figure(self, y: TensorDictBase, title: str = "") -> Figure:
         """A picture of a feature state, of batch ``()``; most models have none and raise a ``TypeError``."""
         raise TypeError(f"model has no picture: {type(self.model).__name__} must give a scene that overrides figure()")
+
+
+class StatesScene(Scene):
+    """The belief over states that have names.
+
+    Args:
+        model: a model whose core entry is a belief over states, and whose hidden states have their numbers as ``"state"``.
+        names: of the states.
+    """
+
+    def __init__(self, model: BeliefModel, names: Sequence[str]) -> None:
+        super().__init__(model)
+        self.names = list(names)
+
+    def layout(self) -> dict[str, Any]:
+        """See :meth:`Scene.layout`."""
+        return {**super().layout(), "bars": self.names[:_MOST_BARS]}
+
+    def frames(self, trajectory: TensorDictBase) -> list[dict[str, Any]]:
+        """See :meth:`Scene.frames`."""
+        frames, hidden = super().frames(trajectory), trajectory.get("hidden", None)
+        truths = [] if hidden is None else [self.names[state] for state in hidden["state"].reshape(-1).tolist()]
+        return [{**frame, "truth": truth} for frame, truth in zip(frames, truths, strict=True)] if truths else frames
 
 
 def rounded(numbers: Tensor) -> list[Any]:

@@ -14,6 +14,7 @@ from torchrl_pomdp.checks import check_sequence, check_text, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.rows import inverse_cdf
+from torchrl_pomdp.envs.scene import Scene, StatesScene
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.envs.tables import table
 from torchrl_pomdp.envs.world import World
@@ -186,6 +187,10 @@ class TabularModel(BeliefModel):
         shape = torch.Size(batch_size)
         belief = Bounded(0.0, 1.0, shape=(*shape, self.num_states), dtype=self.dtype, device=self.device)
         return Composite(belief=belief, shape=shape, device=self.device)
+
+    def scene(self) -> Scene:
+        """How feature states are drawn: a bar for each state, by its name if it has one."""
+        return super().scene() if self.state_names is None else StatesScene(self, self.state_names)
 
     def check_state(self, y: TensorDictBase) -> None:
         """Raise unless ``y`` is a feature state; see :meth:`BeliefModel.check_state`.

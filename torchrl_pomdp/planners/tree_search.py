@@ -123,7 +123,7 @@ class TreeSearch(TensorDictModuleBase):
 
     def _engine(self) -> SearchEngine:
         if find_spec("numba") is None:
-            raise ImportError(f"{type(self).__name__} needs numba: pip install 'torchrl-pomdp[fast]'")
+            raise ImportError(f"{type(self).__name__} needs numba: pip install '.[fast]' in the library's folder")
         limits = Limited(self.max_steps, None, None)
         if self.base_policy is None:
             engine = local_engine((), self.model, limits)

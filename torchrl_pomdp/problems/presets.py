@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from difflib import get_close_matches
 from functools import partial
 from typing import Any
 
@@ -54,7 +55,8 @@ def make_problem(name: str, *, partitioned: bool = True, device: torch.device | 
     check_flag("partitioned", partitioned)
     device = check_device("device", device)
     if name not in PRESETS:
-        known = ", ".join(sorted(PRESETS))
-        raise ValueError(f"name must be that of a problem: unknown preset {shown(name)}; known presets: {known}")
+        known, close = ", ".join(sorted(PRESETS)), get_close_matches(name, PRESETS, 1)
+        hint = f"; do you mean {close[0]}?" if close else ""
+        raise ValueError(f"name must be that of a problem: unknown preset {shown(name)}{hint}; known presets: {known}")
     problem = replace(PRESETS[name](name=name, device=device, **options), spec={"preset": name, **options})
     return problem if partitioned else problem.unpartitioned()

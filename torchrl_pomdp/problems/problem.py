@@ -18,7 +18,7 @@ from torchrl_pomdp.modules.agents import AgentEncoder, FlatAgentEncoder
 from torchrl_pomdp.modules.base_policies import Myopic, as_policy
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.rollout import Policy
-from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, ConstantCost
+from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, ConstantCost, ZeroCost
 
 __all__ = ["Problem", "Symmetry"]
 
@@ -105,6 +105,15 @@ class Problem:
             bound = model.max_cost if model.max_cost is not None else _largest_cost(model, self.start)
             self._set(pessimistic_cost=ConstantCost(model, (bound or 1.0) / (1.0 - model.discount)))
         check_instance("pessimistic_cost", self.pessimistic_cost, ClosedFormCost)
+
+    @property
+    def evaluation_cost(self) -> ClosedFormCost:
+        """What an evaluation adds where a trajectory is cut: the pessimistic cost of the state; nothing if that is a constant.
+
+        A constant bounds the costs of all states from far above. It would be most of a small cost, while what an evaluation
+        leaves out at the model's horizon is a thousandth of it.
+        """
+        return ZeroCost() if isinstance(self.pessimistic_cost, ConstantCost) else self.pessimistic_cost
 
     def _set(self, **values: Any) -> None:
         for name, value in values.items():

@@ -69,7 +69,7 @@ def entry(function: Any, *args: Any) -> Callable[..., Any]:
         function: a loop made by :func:`outer`.
         args: examples of its arguments.
     """
-    timer = Timer(_SOON, _LOG.warning, ["compiling simulations, once: up to 20 seconds"])
+    timer = Timer(_SOON, _announce)
     timer.daemon = True
     timer.start()
     try:
@@ -77,6 +77,18 @@ def entry(function: Any, *args: Any) -> Callable[..., Any]:
     finally:
         timer.cancel()
     return compiled
+
+
+_announced: list[bool] = []
+
+
+def _announce() -> None:
+    """Say once in a process what takes so long."""
+    if not _announced:
+        _announced.append(True)
+        _LOG.warning(
+            "preparing compiled simulations: the first time up to 20 seconds for each kind of policy, later some seconds"
+        )
 
 
 class Loops:

@@ -102,7 +102,7 @@ def open_run_folder(path: str | PathLike[str], identity: dict[str, Any]) -> Path
     # What a kill in the middle of writing the record leaves has its name after a dot.
     in_use = path.exists() and (not path.is_dir() or any(not file.name.startswith(".config.") for file in path.iterdir()))
     if in_use and not record.is_file():
-        raise ValueError(f"run folder {path} is in use: name a folder that is empty, does not exist, or holds this run")
+        raise ValueError(f"run folder {path} holds other files: name a folder that is empty, does not exist, or holds this run")
     claim(record, identity)
     return path
 

@@ -255,7 +255,7 @@ class _Execution:
             num_states=count,
             first=first,
             seed=self.seed,
-            terminal_cost=self.problem.pessimistic_cost,
+            terminal_cost=self.problem.evaluation_cost,
             progress=self.progress,
             name=name,
         )

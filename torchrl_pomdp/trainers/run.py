@@ -279,7 +279,7 @@ class _Execution:
             self.problem.start,
             num_states=states,
             seed=EVALUATION_SEED,
-            terminal_cost=self.problem.pessimistic_cost,
+            terminal_cost=self.problem.evaluation_cost,
             progress=self.progress,
             name=f"evaluate {name}",
             workers=self.workers,
