@@ -29,6 +29,14 @@ _MOST_PAIRS = 12
 # Attributes of cells and rows.
 _TEXT, _BEST = ' class="text"', ' class="best"'
 _TITLES = ("Cost per iteration", "Policies", "Parts", "Where the policies disagree", "Trajectories")
+_WORDS = {
+    "R-NT of a policy": "rollout: simulates the policy after each control and takes the one of least cost; nothing is learnt",
+    "R-T": "the same, where simulations are cut and a learnt cost is added",
+    "API 2": "a network that imitates such rollout, and was improved once more: policy iteration 2",
+    "pAPI-NT 2, pAPI-T 2": "the same with a network for each part of the partition; T: simulations are truncated",
+    "part": "a region of the feature states, which has networks of its own",
+    "Q-factor": "expected discounted cost of a control, with the base policy from there on",
+}
 # What is shown of the losses of a part, and in which form.
 _LOSSES = {"accuracy": ".1%", "regret": ".4g", "relative_error": ".1%"}
 
@@ -109,7 +117,8 @@ def _problem(run: RunFolder) -> str:
     numbers = {**config["config"], "states": config.get("states"), "version": config.get("version")}
     rows = [(name, json.dumps(value)) for name, value in numbers.items()]
     details = f"<details><summary>All numbers of the run</summary>{_rows(('number', 'value'), rows, texts=2)}</details>"
-    return f"<h1>{escape(str(config['problem']))}</h1>{''.join(map(_paragraph, lines))}{details}{_contents()}"
+    words = f"<details><summary>What the words mean</summary>{_rows(('word', 'meaning'), _WORDS.items(), texts=2)}</details>"
+    return f"<h1>{escape(str(config['problem']))}</h1>{''.join(map(_paragraph, lines))}{details}{words}{_contents()}"
 
 
 def _costs(run: RunFolder) -> str:
@@ -137,13 +146,13 @@ def _table(run: RunFolder) -> str:
         (
             result.name,
             interval_text(result.comparison.cost),
-            interval_text(result.comparison.difference),
             *ratio_texts(result.comparison.ratio),
+            interval_text(result.comparison.difference),
             str(result.comparison.cost.count),
         )
         for result in run.results
     ]
-    head = ("policy", "discounted cost", "difference", "ratio", "95 % interval of the ratio", "start states")
+    head = ("policy", "discounted cost", "ratio", "95 % interval of the ratio", "difference", "start states")
     text = f"Differences and ratios are paired with {run.results[0].name}: same start states, same noise. Lower is better."
     marked = [number for number, result in enumerate(run.results) if result.name == best]
     return _section("Policies", _paragraph(text) + _rows(head, rows, marked))
