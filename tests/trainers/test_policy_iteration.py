@@ -257,7 +257,7 @@ def test_to_iterate_again_is_to_start_anew(line3):
 
 def test_a_folder_is_of_one_run(line3, tmp_path):
     run(line3, folder=tmp_path)
-    with pytest.raises(ValueError, match="holds another run, which differs in config: name another folder"):
+    with pytest.raises(ValueError, match=r"holds another run, which differs in config\.seed: name another folder"):
         run(line3, replace(TINY, seed=1), folder=tmp_path)
     with pytest.raises(ValueError, match="differs in plan"):
         run(line3, recipe=papi_t, folder=tmp_path)
