@@ -16,6 +16,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
+import torch
 from _hostile import Hostile
 from _refusals_exact import EXACT
 from _refusals_gym import GYM
@@ -26,6 +27,10 @@ from _refusals_results import FILES, REPORTS
 from _refusals_training import COLLECTORS, TRAINERS
 from _refusals_world import WORLDS
 from _valid import Case
+
+from torchrl_pomdp.modules import RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.problems import make_problem
 
 CASES: dict[str, Callable[[Path], Case]] = {
     **ENVS,
@@ -61,6 +66,14 @@ EXEMPT = {
 
 LIMIT_SECONDS = 2.0
 LEAST_CALLS = 1500
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    """Simulations that are cut are compiled before the time of a refusal counts."""
+    model = make_problem("line3").model
+    cut = {"trajectories": 1, "max_steps": 3, "terminal_cost": lambda y: torch.zeros(y.batch_size)}
+    RolloutPolicy(model, GreedyRepair(model), **cut)(make_problem("line3").start(torch.arange(2)))
 
 
 @pytest.mark.parametrize("name", CASES)
