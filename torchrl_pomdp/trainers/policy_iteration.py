@@ -364,7 +364,7 @@ class PolicyIteration:
             num_states=config.validation_states,
             seed=self._seed(0, "validation"),
             max_steps=config.max_steps,
-            terminal_cost=problem.evaluation_cost,
+            terminal_cost=self._scale,
             progress=self.progress,
             name=f"validate {name}",
             workers=self.workers,
