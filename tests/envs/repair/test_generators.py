@@ -7,6 +7,7 @@ import torch
 from _oracles import varied_model
 
 from torchrl_pomdp.envs.repair import RandomState, RepairModel, line
+from torchrl_pomdp.envs.repair.chains import chain_powers
 
 
 @pytest.mark.parametrize("robots", [1, 2])
@@ -30,3 +31,21 @@ def test_random_states_have_aged_by_the_chains_of_their_locations(robots):
     assert ((counts - 125).abs() < 45).all()
     seen = aged["belief"].gather(1, aged["location"].unsqueeze(-1).expand(-1, -1, 3))
     assert (seen.amax(-1) == 1).all()
+
+
+def test_powers_of_a_chain_are_those_of_plain_floats_on_every_machine():
+    def row(p, q):
+        return [p * (1 - a) + q * b, p * a + q * (1 - b)]
+
+    a, b = 0.3, 0.1
+    chain, expected = torch.tensor([[1 - a, a], [b, 1 - b]], dtype=torch.float64), [[[1.0, 0.0], [0.0, 1.0]]]
+    for _ in range(40):
+        expected.append([row(*level) for level in expected[-1]])
+    assert chain_powers(chain, 40).tolist() == expected
+
+
+def test_powers_of_the_chains_of_many_locations():
+    chain = torch.rand(7, 5, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    chain /= chain.sum(-1, keepdim=True)
+    expected = torch.stack([torch.linalg.matrix_power(chain, age) for age in range(41)])
+    torch.testing.assert_close(chain_powers(chain, 40), expected, rtol=1e-12, atol=1e-15)

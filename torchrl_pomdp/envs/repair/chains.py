@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_number, shown
+from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.tensor_checks import check_tensor
 
 __all__ = [
     "MAX_LEVELS",
+    "chain_powers",
     "checked_chain",
     "checked_costs",
     "damage_chain",
@@ -55,6 +57,20 @@ def damage_chain(degradation: Sequence[float]) -> Tensor:
     probs = [check_number(f"degradation[{level}]", p, "[0, 1]") for level, p in enumerate(degradation)]
     rise = torch.tensor(probs, dtype=torch.float64)
     return torch.diag(torch.cat([1.0 - rise, rise.new_ones(1)])) + torch.diag(rise, 1)
+
+
+def chain_powers(chain: Tensor, count: int) -> Tensor:
+    """The powers 0 … ``count`` of matrices ``[., K, K]``, to the same bit on every machine, ``[count + 1, ., K, K]``.
+
+    A library's product of matrices rounds by processor, device and threads, and a generator's states are to be the same.
+    """
+    own = chain.cpu().double()
+    powers = [torch.eye(own.shape[-1], dtype=own.dtype).expand_as(own)]
+    for _ in range(count):
+        # [K, ., K, K]: level by level.
+        terms = powers[-1].movedim(-1, 0).unsqueeze(-1) * own.movedim(-2, 0).unsqueeze(-2)
+        powers.append(sum_first(terms))
+    return torch.stack(powers).to(chain)
 
 
 def checked_chain(chain: Any, num_locations: int) -> Tensor:

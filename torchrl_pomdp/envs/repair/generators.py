@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_flag, check_instance, check_integer, check_number, shown
+from torchrl_pomdp.envs.repair.chains import chain_powers
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.noise import fold, uniform
@@ -122,11 +123,9 @@ class RandomState:
             raise ValueError(f"fractions must satisfy 0 <= low <= high <= 1, got {fractions}")
         self.model, self.max_age = model, check_integer("max_age", max_age, 0, _MOST_AGE)
         self.range = max(1, round(low * model.num_locations)), max(1, round(high * model.num_locations))
-        # A library's products of matrices may differ by device and threads; on a CPU one thread does so few numbers.
-        chain = model.chain.cpu()
-        powers = torch.stack([torch.linalg.matrix_power(chain, age) for age in range(max_age + 1)]).to(model.device)
         # [ages, L or 1, K, K].
-        self._powers = powers if chain.ndim == 3 else powers.unsqueeze(1)
+        powers = chain_powers(model.chain, max_age)
+        self._powers = powers if model.chain.ndim == 3 else powers.unsqueeze(1)
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
