@@ -179,8 +179,10 @@ def read_text(path: str | PathLike[str], encoding: str = "utf-8") -> str:
     """
     path = check_path("path", path)
     check_choice("encoding", encoding, ("utf-8", "latin-1"))
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {path}")
     # What is no plain file, such as a pipe, might never end.
-    if path.exists() and not path.is_file():
+    if not path.is_file():
         raise ValueError(f"path must be a file, {path} is none")
     if path.stat().st_size > _MOST_BYTES:
         raise ValueError(f"{path} must hold at most {_MOST_BYTES} bytes, got {path.stat().st_size}")

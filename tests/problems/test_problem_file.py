@@ -158,7 +158,7 @@ BROKEN = [
     (changed(TABULAR, "start = [1, 0]", "start = [1, 1]"), ", line 7", "tabular.start: belief must"),
     (changed(TABULAR, "start = [1, 0]", "start = [1, 0, 0]"), ", line 7", "tabular.start: start must be a distribution over 2 states"),
     (changed(TABULAR, '"replace"]', '"run"]'), ", line 9", "tabular.controls: control_names"),
-    ('pomdp = "none.POMDP"', ", line 1", "pomdp: must be a file that can be read, got 'none.POMDP'.*No such file"),
+    ('pomdp = "none.POMDP"', ", line 1", "pomdp: must be a file that can be read, got 'none.POMDP'.*there is no file"),
     ('pomdp = "."', ", line 1", "pomdp: must be a file that can be read, got '.'.*must be a file"),
     ('pomdp = "a\\u0000b"', ", line 1", "pomdp: must be a file that can be read"),
     ('name = "../../x"' + REPAIR, ", line 1", "name: name must have .* no slash"),

@@ -125,7 +125,9 @@ def _starts(model: BeliefModel, generator: StateGenerator, seed: int) -> TensorD
         part = model.drawn(generator, keys[:count].view(shape)).select(*model.state_keys)
         rule = "a key has the same state in every batch and at every call"
         mend = "Make states from the keys alone, as torchrl_pomdp.noise.uniform(keys, i) does; use no other random numbers."
-        require(same(part.reshape(count), y[:count]), "generator", rule, f"another state in batch {shape}", mend)
+        require(
+            same(part.reshape(count), y[:count]), "generator of start states", rule, f"another state in batch {shape}", mend
+        )
     return y
 
 
@@ -136,6 +138,7 @@ def _visited(probe: Probe, starts: TensorDictBase, seed: int) -> tuple[TensorDic
     for stage in range(_STAGES):
         noise = noise_of(model, fold(keys, stage + 1), model.noise_dim + 1)
         u = random_control(probe.mask(y), noise[:, -1])
+        _call_parts(probe, y, u)
         y = probe.advance(y, u, noise[:, :-1])[1].select(*model.state_keys)
         seen.append(y)
     every = torch.cat([each.clone() for each in seen])
@@ -145,6 +148,15 @@ def _visited(probe: Probe, starts: TensorDictBase, seed: int) -> tuple[TensorDic
     every = every[first[first < len(number)].sort().values]
     ended = probe.terminal(every)
     return _spread(every[~ended], _STATES), _spread(every[ended], _STATES)
+
+
+def _call_parts(probe: Probe, y: TensorDictBase, u: Tensor) -> None:
+    """Call what ``advance`` may be made of, so that a fault in it is found there and not blamed on ``advance``."""
+    probe.terminal(y)
+    probe.cost(y, u)
+    probe.observed(y, u)
+    if probe.model.num_observations <= _MOST_OBSERVATIONS:
+        probe.estimator(y, u, probe.probs(y, u).argmax(-1))
 
 
 def _spread(y: TensorDictBase, count: int) -> TensorDictBase:
@@ -208,12 +220,12 @@ def _check_batches(probe: Probe, pairs: Pairs, outcomes: Outcomes | None) -> Non
         ("fingerprint", probe.fingerprint, (pairs.y,)),
         ("expected_cost", probe.cost, (pairs.y, pairs.u)),
         ("observed", probe.observed, (pairs.y, pairs.u)),
-        ("advance", probe.advance, (pairs.y, pairs.u, noise)),
-        ("advance", probe.advance, (model.derive(pairs.y), pairs.u, noise)),
     ]
     if outcomes is not None:
         calls.append(("observation_probs", probe.probs, (pairs.y, pairs.u)))
         calls.append(("estimator", probe.estimator, (pairs.y[outcomes.pair], pairs.u[outcomes.pair], outcomes.z)))
+    # Last what may be made of the others.
+    calls += [("advance", probe.advance, (y, pairs.u, noise)) for y in (pairs.y, model.derive(pairs.y))]
     for name, method, given in calls:
         _check_batch(name, method, given)
 
