@@ -108,19 +108,29 @@ def test_where_nothing_can_be_written_every_process_compiles(monkeypatch):
 
 
 SCRIPT = """
-from torchrl_pomdp.scalar.compiling import entry, outer
-@outer
-def triple(x):
+import sys
+from torchrl_pomdp.scalar.compiling import entry, inner, outer
+@inner
+def part(x):
     return 3 * x
-entry(triple, 1.0)
-print(sum(triple.stats.cache_hits.values()), sum(triple.stats.cache_misses.values()))
+@outer
+def once(x):
+    return part(x)
+@outer
+def twice(x):
+    return part(x) + part(x)
+loop = globals()[sys.argv[1]]
+assert entry(loop, 1.0)(1.0) == {"once": 3.0, "twice": 6.0}[sys.argv[1]]
+for function in (loop, part):
+    print(sum(function.stats.cache_hits.values()), sum(function.stats.cache_misses.values()))
 """
 
 
-def test_a_second_process_reads_what_the_first_has_compiled(tmp_path):
+def test_another_process_reads_what_has_been_compiled_and_another_loop_the_parts(tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT)
     told = [
-        subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-        for _ in "ab"
+        subprocess.run([sys.executable, "script.py", loop], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+        for loop in ("once", "once", "twice")
     ]
-    assert told == ["0 1\n", "1 0\n"]
+    # Hits and misses of the loop and of its part; a loop that is read asks for no part.
+    assert told == ["0 1\n0 1\n", "1 0\n0 0\n", "0 1\n1 0\n"]

