@@ -57,7 +57,7 @@ PRINTED = {
     "06_many_robots": ["31 Q-factors for one decision of 8 robots", "| signalled |", "| rollout of it |"],
     "07_ray": ["equal to the last bit: True", "the bound was kept: True", "Ray is running: False"],
     "08_your_own_pomdp": [
-        "row (0, 1) sums to 1.1", "Careless: advance: the stage cost", "Undivided: advance: the next state",
+        "row (0, 1) sums to 1.1", "Careless: expected_cost: the result", "Undivided: estimator: the next state",
         "the model and the arrays agree", "got 'looks blue'", "state unchanged: True", "restarted, 3 controls are behind us",
     ],
 }  # fmt: skip
