@@ -1,5 +1,5 @@
 .DELETE_ON_ERROR:
-.PHONY: demo test lint tutorials docs benchmarks
+.PHONY: demo test pytest lint tutorials docs benchmarks
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -8,8 +8,12 @@ DEMO ?= runs/demo-$(shell date +%Y%m%d-%H%M%S)
 demo: .venv/installed
 	$(BIN)/torchrl-pomdp train linear20 --samples-per-part 6000 --iterations 2 --out $(DEMO)
 
+# Types are checked beside the tests, by one process that takes a minute.
+test: .venv/installed
+	+$(MAKE) --no-print-directory --jobs 2 lint pytest
+
 # Each worker computes with one thread, as many workers as there are processors.
-test: .venv/installed lint
+pytest: .venv/installed
 	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist worksteal
 
 lint: .venv/installed

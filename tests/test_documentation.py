@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -10,6 +11,7 @@ import jupytext
 import nbformat
 import pytest
 import torch
+from jupyter_client import KernelManager
 from nbclient import NotebookClient
 from tensordict import TensorDict
 from test_fuzz import PUBLIC
@@ -233,16 +235,26 @@ def test_notebooks_are_their_scripts(script):
     assert cells[0] == cells[1], f"run `make tutorials`: {script.stem}.ipynb is not made from its script"
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-def test_tutorials_run_at_a_small_size(script, monkeypatch):
+@pytest.fixture(scope="module")
+def kernel():
+    """One kernel for all tutorials: to import PyTorch and TorchRL takes longer than most of them."""
     # Ray's workers give way to all other processes: beside other tests they would hardly get on.
-    monkeypatch.setenv("RAY_worker_niceness", "0")
+    manager = KernelManager(kernel_name="python3")
+    manager.start_kernel(env={**os.environ, "RAY_worker_niceness": "0"})
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_tutorials_run_at_a_small_size(script, kernel):
     notebook = jupytext.read(script)
+    # No name of the tutorial before is left.
+    notebook.cells.insert(0, nbformat.v4.new_code_cell("%reset -f"))
     (parameters,) = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
     for name, value in SMALL[script.stem].items():
         parameters.source, count = re.subn(rf"^{name} = .*$", f"{name} = {value}", parameters.source, flags=re.MULTILINE)
         assert count == 1, name
-    NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+    NotebookClient(notebook, km=kernel, timeout=300).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     text = "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")

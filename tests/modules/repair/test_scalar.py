@@ -372,29 +372,29 @@ def test_networks_choose_as_in_batches(robots, mixed, kind):
     assert_close(compiled.q_factors(y), without(make).q_factors(y))
 
 
+@pytest.mark.parametrize("lost", [None, 0, 1, 2])
 @pytest.mark.parametrize("kind", [UrgencyRepair, "networks"])
-def test_old_policies_in_a_changed_model(kind):
-    """Another chain, and two blocked edges, against which the old policies walk."""
+def test_old_policies_in_a_changed_model(kind, lost):
+    """Another chain, other parts, two blocked edges, against which the old policies walk, and maybe a robot that is lost."""
     graphs, costs = (grid(3, 3), grid(3, 3).without_edge(1, 4).without_edge(3, 4)), (0, 0.1, 1, 10)
+    robots = (2, 2) if lost is None else (3, 2)
+    parts = [RepairPartition(graph, costs, damage_threshold=p) for graph, p in zip(graphs, (0.1, 0.0), strict=True)]
     old, new = (
-        RepairModel(graph, damage_chain(rates), costs, 0.95, num_robots=2).with_partition(RepairPartition(graph, costs))
-        for graph, rates in zip(graphs, [(0.0, 0.02, 0.03), (0.01, 0.1, 0.2)], strict=True)
+        RepairModel(graph, damage_chain(rates), costs, 0.95, num_robots=n).with_partition(part)
+        for graph, rates, n, part in zip(graphs, [(0.0, 0.02, 0.03), (0.01, 0.1, 0.2)], robots, parts, strict=True)
     )
     policy = networks(old, {0: UrgencyRepair(old)}) if kind == "networks" else kind(old)
-    changed, y = OldPolicy(policy, old, new), some_states(new, 3, 200)
-    walls = old.split_controls(policy(old.derive(y))["action"]), new.agent_mask(y)
-    assert not walls[1].gather(-1, walls[0].unsqueeze(-1)).all()
+    changed, y = OldPolicy(policy, old, new, lost, 0 if lost is None else 5), some_states(new, 3, 200)
+    if lost is None:
+        walls = old.split_controls(policy(old.derive(y))["action"]), new.agent_mask(y)
+        assert not walls[1].gather(-1, walls[0].unsqueeze(-1)).all()
     means_the_same(new, changed, y, {"max_steps": 60, "terminal_cost": SteadyStateCost(new)}, 3)
 
 
 def test_old_policies_that_are_left_to_tensors(linear20):
     old = linear20.model
-    dear, lost = (
-        RepairModel(old.graph, old.chain, 2 * old.costs, 0.95),
-        RepairModel(old.graph, old.chain, old.costs, 0.95, num_robots=2),
-    )
+    dear = RepairModel(old.graph, old.chain, 2 * old.costs, 0.95)
     assert RolloutPolicy(dear, OldPolicy(UrgencyRepair(old), old, dear)).cost_to_go.scalar is None
-    assert RolloutPolicy(old, OldPolicy(UrgencyRepair(lost), lost, old, 1, 3)).cost_to_go.scalar is None
     assert RolloutPolicy(old, OldPolicy(lambda y: y, old, old)).cost_to_go.scalar is None
 
 

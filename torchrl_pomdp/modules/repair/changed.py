@@ -69,11 +69,11 @@ class OldPolicy(TensorDictModuleBase):
                 raise ValueError(f"new must have as many {name} as old, got {other} for {one}")
 
     def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
-        """Compiled simulations, see :class:`~torchrl_pomdp.modules.scalar.ScalarEngine`; none where a robot is lost."""
+        """Compiled simulations, see :class:`~torchrl_pomdp.modules.scalar.ScalarEngine`."""
         from torchrl_pomdp.modules.repair.scalar.changed import changed_engine
 
-        fits = model is self.new and self.lost is None
-        return changed_engine(self.policy, self.old, self.new, limits) if fits else None
+        fits = model is self.new
+        return changed_engine(self.policy, self.old, self.new, limits, self.lost, self.place) if fits else None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"`` for feature states of the changed model."""

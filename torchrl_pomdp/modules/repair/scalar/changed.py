@@ -15,26 +15,34 @@ from torchrl_pomdp.modules.scalar import Limited, scalar_engine
 
 __all__ = ["changed_engine"]
 
-# What tables hold of a graph, which is the old one to an old policy; and of parts, in which old and new model must agree.
+# What tables hold of a graph and of parts, which are the old ones to an old policy.
 _GRAPH = ("destinations", "order", "distances", "first_controls", "first_moves", "unrestricted")
-_PARTS = ("columns", "prices", "damage_threshold", "low", "high")
+_PARTS = ("columns", "damage_threshold", "low", "high")
 
 
-def changed_engine(policy: Any, old: RepairModel, new: RepairModel, limits: Limited) -> RepairEngine | None:
-    """The engine of a policy of model ``old`` in ``new``, of as many robots; None where the policy has no twin.
+def changed_engine(
+    policy: Any, old: RepairModel, new: RepairModel, limits: Limited, lost: int | None, place: int
+) -> RepairEngine | None:
+    """The engine of a policy of model ``old`` in ``new``; None where the policy has no twin.
 
     Args:
         policy: the old policy.
         old: the model that it was made for.
         new: the model that is simulated.
+        lost: number of the robot that is lost; None: there are as many as before.
+        place: where it broke down.
         limits: see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`.
     """
     before = scalar_engine(policy, old, limits._replace(truncation=None, terminal_cost=None))
-    # Its costs of levels are read from the new model's tables, as are the parts.
+    # Costs of levels, those that parts are told by among them, are read from the new model's tables, where its chain is.
     if not isinstance(before, RepairEngine) or not torch.equal(old.costs, new.costs):
         return None
     known, now = before.tables, make_tables(new, limits.max_steps + 2)
-    if not all(np.array_equal(getattr(known, name), getattr(now, name)) for name in _PARTS):
+    if not np.array_equal(known.prices, now.prices):
         return None
-    seen = now._replace(**{name: getattr(known, name) for name in _GRAPH})
-    return repair_engine(elsewhere, (seen, before.policy), new, new, limits, numbers=before.numbers, refresh=before.refresh)
+    seen = now._replace(**{name: getattr(known, name) for name in (*_GRAPH, *_PARTS)})
+    # Locations and controls take two of these numbers each, and begin where one of theirs may.
+    own = before.numbers + before.numbers % 2
+    data = seen, before.policy, -1 if lost is None else lost, place, own
+    numbers = own + 4 * old.num_robots
+    return repair_engine(elsewhere, data, new, new, limits, numbers=numbers, refresh=before.refresh)

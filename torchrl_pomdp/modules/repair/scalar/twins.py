@@ -180,14 +180,24 @@ def networks(data, view, controls):
 
 @scalar_twin
 def elsewhere(data, view, controls):
-    """A policy that knows another graph; for a control that is illegal here, the first that is legal.
+    """A policy that knows another graph, and maybe a robot more; for a control that is illegal here, the first that is legal.
 
-    ``data`` holds the tables that the policy sees, with the old graph, and the policy.
+    ``data`` holds the tables that the policy sees, with the old graph; the policy; the lost robot, -1 for none, and where it
+    stands; and how many numbers are for the policy's own use. Those after them are locations and controls of its robots.
     """
-    tables, policy = data
-    seen = View(view.stage, view.location, view.level, view.since, view.intact, view.start, tables, view.work, view.key)
-    choose(policy, seen, controls)
+    tables, policy, lost, place, numbers = data
+    robots = len(controls) + (1 if lost >= 0 else 0)
+    own = view.work[numbers:].view(np.int64)
+    location, chosen = own[:robots], own[robots : 2 * robots]
     for robot in range(len(controls)):
+        location[robot + (1 if 0 <= lost <= robot else 0)] = view.location[robot]
+    if lost >= 0:
+        location[lost] = place
+    work = view.work[:numbers]
+    seen = View(view.stage, location, view.level, view.since, view.intact, view.start, tables, work, view.key)
+    choose(policy, seen, chosen)
+    for robot in range(len(controls)):
+        controls[robot] = chosen[robot + (1 if 0 <= lost <= robot else 0)]
         # What is no control at all stays one that is refused.
         if controls[robot] >= 0 and not legal(view, robot, controls[robot]):
             controls[robot] = 0
