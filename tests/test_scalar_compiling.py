@@ -92,7 +92,7 @@ def test_a_long_compilation_is_announced_and_a_short_one_is_not(caplog, monkeypa
         assert entry(outer(lambda x: x + 2), 1.5)(1.5) == 3.5
         assert not caplog.records
         monkeypatch.setattr(compiling, "_SOON", 0.0)
-        monkeypatch.setattr(compiling, "_announced", [])
+        compiling._announce.cache_clear()
         for _ in range(2):
             assert entry(outer(slow), 1.0)(1.0) == 2.0
     (told,) = [record.getMessage() for record in caplog.records]
@@ -105,6 +105,14 @@ def test_where_nothing_can_be_written_every_process_compiles(monkeypatch):
 
     monkeypatch.setattr(Dispatcher, "enable_caching", refuse)
     assert outer(lambda x: 3 * x)(2) == 6
+
+
+def test_names_may_be_long():
+    def function_of_a_very_long_name(x):
+        return 5 * x
+
+    function_of_a_very_long_name.__name__ = 300 * "x"
+    assert outer(function_of_a_very_long_name)(2) == 10
 
 
 SCRIPT = """

@@ -5,7 +5,19 @@ from __future__ import annotations
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-__all__ = ["inverse_cdf", "put_rows", "random_control", "take_rows"]
+__all__ = ["flat_rows", "inverse_cdf", "put_rows", "random_control", "take_rows"]
+
+
+def flat_rows(y: TensorDictBase) -> TensorDictBase:
+    """The states of a batch ``[*B]`` as a flat one ``[N]``.
+
+    ``y.reshape(-1)`` would make a row of none.
+
+    Examples:
+        >>> flat_rows(TensorDict({}, [2, 3])).batch_size, flat_rows(TensorDict({}, [2, 0])).batch_size
+        (torch.Size([6]), torch.Size([0]))
+    """
+    return y.reshape(y.batch_size.numel())
 
 
 def inverse_cdf(probs: Tensor, noise: Tensor, dim: int = -1) -> Tensor:

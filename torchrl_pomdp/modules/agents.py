@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance, check_sizes
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.rows import flat_rows
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.networks import LocalNetwork, check_finite_output
 from torchrl_pomdp.modules.rowwise import RowLinear, product, rowwise
@@ -149,7 +150,7 @@ class AgentNetwork(LocalNetwork):
         """Write ``"logits"`` and ``"action"`` for feature states ``[*B]``."""
         told = check_instance("tensordict", tensordict, TensorDictBase).get("told", None)
         keys = self.in_keys if told is None else [*self.in_keys, "told"]
-        flat = check_entries("tensordict", tensordict, keys).select(*keys).reshape(-1)
+        flat = flat_rows(check_entries("tensordict", tensordict, keys).select(*keys))
         logits, controls = self._decide(flat) if told is None else self._taught(flat)
         action = self.model.join_controls(controls)
         entries = TensorDict({"logits": logits, "action": action}, batch_size=flat.batch_size)
@@ -162,7 +163,7 @@ class AgentNetwork(LocalNetwork):
         hidden = hidden + self._weights(encoder.own_marks(y))
         if encoder.num_own:
             own = encoder.own_features(y)
-            hidden = hidden + product(own.flatten(0, 1), self.own).view(*own.shape[:-1], -1)
+            hidden = hidden + product(own.flatten(0, 1), self.own).view(hidden.shape)
         return hidden, self.model.agent_mask(y)
 
     def _rest(self, hidden: Tensor, mask: Tensor) -> Tensor:
@@ -176,7 +177,7 @@ class AgentNetwork(LocalNetwork):
         total = self.marks.index_select(0, marks[..., 0].reshape(-1))
         for place in range(1, marks.shape[-1]):
             total = total + self.marks.index_select(0, marks[..., place].reshape(-1))
-        return total.view(*marks.shape[:-1], -1)
+        return total.view(*marks.shape[:-1], total.shape[-1])
 
     def _decide(self, y: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Logits ``[N, R, A]`` and controls ``[N, R]``, one agent after the other."""

@@ -12,6 +12,7 @@ from torchrl.data import Categorical
 
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.rows import flat_rows
 from torchrl_pomdp.modules.rowwise import rowwise
 from torchrl_pomdp.tensor_checks import check_entries
 
@@ -28,7 +29,7 @@ class Encoder(nn.Module):
     def forward(self, y: TensorDictBase) -> Tensor:
         """Features ``[*B, F]`` of feature states ``[*B]``."""
         check_entries("y", y, self.keys)
-        return self.encode_rows(y.reshape(-1), None).reshape(*y.batch_size, self.num_features)
+        return self.encode_rows(flat_rows(y), None).reshape(*y.batch_size, self.num_features)
 
     @abstractmethod
     def encode_rows(self, y: TensorDictBase, rows: Tensor | None) -> Tensor:

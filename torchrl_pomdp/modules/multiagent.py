@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_choice, check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.rows import flat_rows
 from torchrl_pomdp.modules.qfactors import SimulatedQFactors, cheapest
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, controls_of
 from torchrl_pomdp.modules.truncation import Truncation
@@ -129,7 +130,7 @@ class MultiagentRollout(SimulatedQFactors):
         """
         self.model.check_state(check_instance("tensordict", tensordict, TensorDictBase))
         shape, model = tensordict.batch_size, self.model
-        y = model.derive(tensordict.select(*model.state_keys).reshape(-1))
+        y = model.derive(flat_rows(tensordict.select(*model.state_keys)))
         base = self._controls("base_policy", self.cost_to_go.base_policy, y)
         decide = {"one_at_a_time": self._in_turn, "order_optimised": self._best_first, "autonomous": self._at_once}
         controls, q = decide[self.scheme](y, base, model.agent_mask(y))
@@ -161,7 +162,7 @@ class MultiagentRollout(SimulatedQFactors):
             agent = left[rows, place]
             result[rows, agent] = q[rows, place]
             controls[rows, agent] = cheapest(q[rows, place])
-            left = left[left != agent.unsqueeze(-1)].view(len(base), -1)
+            left = left[left != agent.unsqueeze(-1)].view(len(base), left.shape[1] - 1)
         return controls, result
 
     def _at_once(self, y: TensorDictBase, base: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:

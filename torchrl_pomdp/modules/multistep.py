@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
-from torchrl_pomdp.envs.rows import inverse_cdf, take_rows
+from torchrl_pomdp.envs.rows import flat_rows, inverse_cdf, take_rows
 from torchrl_pomdp.modules.lookahead import RolloutPolicy
 from torchrl_pomdp.modules.qfactors import cheapest, check_q_factors
 from torchrl_pomdp.noise import fold, uniform
@@ -77,7 +77,7 @@ class MultistepLookahead(TensorDictModuleBase):
     def q_factors(self, y: TensorDictBase) -> Tensor:
         r""":math:`Q_\ell(y,u)` ``[*B, U]``, costs; ``+inf`` where the control is illegal or, with a margin, dominated."""
         self.model.check_state(y)
-        flat = y.select(*self.model.state_keys).reshape(-1)
+        flat = flat_rows(y.select(*self.model.state_keys))
         if flat.batch_size[0] == 0:
             return self.policy.q_factors(y)
         # With a time for each decision, roots have trees of their own.

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_sizes
 from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.envs.rows import take_rows
+from torchrl_pomdp.envs.rows import flat_rows, take_rows
 from torchrl_pomdp.modules.encoders import Encoder, transformed
 from torchrl_pomdp.modules.rowwise import RowLinear, rowwise
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, local_engine
@@ -58,7 +58,7 @@ class LocalNetwork(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the ``out_keys`` for feature states ``[*B]``."""
-        flat = check_entries("tensordict", tensordict, self.in_keys).select(*self.in_keys).reshape(-1)
+        flat = flat_rows(check_entries("tensordict", tensordict, self.in_keys).select(*self.in_keys))
         rows = torch.arange(flat.batch_size[0], device=flat.device)
         entries = evaluate_networks([self], flat, rows, [rows.numel()])
         return tensordict.update(entries.reshape(tensordict.batch_size))

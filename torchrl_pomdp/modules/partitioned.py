@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.envs.rows import take_rows
+from torchrl_pomdp.envs.rows import flat_rows, take_rows
 from torchrl_pomdp.modules.networks import LocalNetwork, evaluate_networks
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, local_engine
 from torchrl_pomdp.tensor_checks import check_entries
@@ -63,7 +63,7 @@ class _Partitioned(TensorDictModuleBase):
         known = part.dtype == torch.int64 and (part.numel() == 0 or 0 <= int(part.min()) <= int(part.max()) < len(members))
         if not known:
             raise ValueError(f"partition must hold parts 0..{len(members) - 1}, got {part.unique().tolist()}")
-        flat = tensordict.select(*self.in_keys).reshape(-1)
+        flat = flat_rows(tensordict.select(*self.in_keys))
         result = self._route(flat, part, members)
         return tensordict.update(result.reshape(tensordict.batch_size))
 
@@ -72,7 +72,7 @@ class _Partitioned(TensorDictModuleBase):
         distinct = list(dict.fromkeys(members))
         networks = [member for member in distinct if isinstance(member, LocalNetwork) and member.kind is not None]
         networks = networks if len({network.kind for network in networks}) == 1 else []
-        if len(distinct) == 1 and not networks:
+        if (len(distinct) == 1 and not networks) or len(part) == 0:
             return distinct[0](y).select(*self.out_keys)
         # Networks come last, so that their rows are neighbours once the batch is sorted.
         others = [member for member in distinct if member not in networks]

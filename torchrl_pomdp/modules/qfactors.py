@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.envs.rows import take_rows
+from torchrl_pomdp.envs.rows import flat_rows, take_rows
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scalar import Allocation, ScalarEngine
@@ -138,7 +138,7 @@ class SimulatedQFactors(TensorDictModuleBase):
         if engine is not None and engine.closed:
             return self._compiled(engine, y, controls, keys, seconds)
         self.model.check_state(y)
-        flat = self.model.derive(y, ("action_mask",) if mask is None else ()).reshape(-1)
+        flat = flat_rows(self.model.derive(y, ("action_mask",) if mask is None else ()))
         mask = flat.get("action_mask") if mask is None else mask
         if mask.numel() == 0:
             return torch.zeros(mask.shape, dtype=self.model.dtype, device=self.model.device)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.envs.rows import take_rows
+from torchrl_pomdp.envs.rows import flat_rows, take_rows
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.rollout import MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
@@ -161,7 +161,7 @@ class PolicyCost(TensorDictModuleBase):
         self.model.check_state(y)
         if y.batch_size.numel() == 0:
             return torch.zeros(y.batch_size, dtype=self.model.dtype, device=self.model.device)
-        flat = self.model.derive(y, self.model.state_keys).reshape(-1)
+        flat = flat_rows(self.model.derive(y, self.model.state_keys))
         size, threads = blocks(flat.shape[0], self.trajectories, self.rollout.chunk_rows, self.model.device)
         return torch.cat(map_threads(self._costs, flat.split(size), threads)).view(y.batch_size)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable
+from functools import cache
 from threading import Timer
 from types import CodeType, FunctionType
 from typing import Any
@@ -51,7 +52,8 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
     They are kept by name, which a digest of the code in them makes another one when that changes.
     """
-    function.__qualname__ += f"_{code_digest(function)}"
+    # Names of files may not be long.
+    function.__qualname__ = f"{function.__name__[:64]}_{code_digest(function)}"
     compiled: Callable[..., Any]
     try:
         compiled = njit(cache=True, **options)(function)
@@ -80,16 +82,10 @@ def entry(function: Any, *args: Any) -> Callable[..., Any]:
     return compiled
 
 
-_announced: list[bool] = []
-
-
+@cache
 def _announce() -> None:
     """Say once in a process what takes so long."""
-    if not _announced:
-        _announced.append(True)
-        _LOG.warning(
-            "preparing compiled simulations: the first time up to 20 seconds for each kind of policy, later some seconds"
-        )
+    _LOG.warning("preparing compiled simulations: the first time up to 20 seconds for each kind of policy, later some seconds")
 
 
 class Loops:

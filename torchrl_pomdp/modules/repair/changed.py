@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.repair.model import RepairModel
+from torchrl_pomdp.envs.rows import flat_rows
 from torchrl_pomdp.modules.rollout import Policy, controls_of
 from torchrl_pomdp.modules.scalar import Limited, ScalarEngine
 from torchrl_pomdp.tensor_checks import check_entries
@@ -77,7 +78,7 @@ class OldPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"`` for feature states of the changed model."""
-        y = check_entries("tensordict", tensordict, self.in_keys).select(*self.in_keys).reshape(-1)
+        y = flat_rows(check_entries("tensordict", tensordict, self.in_keys).select(*self.in_keys))
         location = y.get("location")
         if self.lost is not None:
             broken = torch.full_like(location[:, :1], self.place)

@@ -270,7 +270,7 @@ class RobotEncoder(AgentEncoder):
         """How much damage lies each way; see the class."""
         belief, location = y.get("belief"), y.get("location")
         costs = location_costs(belief.permute(1, 2, 0), self._prices).T.clamp_min(0.0)
-        robots = self.nearness.index_select(0, location.T.flatten()).view(*location.T.shape, -1)
+        robots = self.nearness.index_select(0, location.T.flatten()).view(*location.T.shape, len(self.nearness))
         shared = costs / sum_first(robots.clone())
         place = location.unsqueeze(-1).expand(-1, -1, self.num_own // 2)
         shape = len(location), self.model.num_locations, self.num_own // 2
