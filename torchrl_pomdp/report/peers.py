@@ -108,8 +108,12 @@ def peer_figure(outcomes: Mapping[str, Outcome], title: str = "") -> Figure:
                 label=name,
             )
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
     if ratios and max(outcome.comparison.cost.mean for outcome in found.values()) > 0:
-        axes.set_yscale("log")
+        # Ratios lie within a decade: plain numbers, also between its ends.
+        axes.set_yscale("log", subs=[1.2, 1.5, 2, 3, 4, 5, 6, 7, 8, 9])
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
     axes.set(
         xlabel="time of a decision, ms", ylabel="cost, ratio to the baseline" if ratios else "discounted cost", title=title
     )
