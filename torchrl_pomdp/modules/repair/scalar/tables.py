@@ -9,8 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchrl_pomdp.envs.repair.chains import chain_powers
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
+from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.repair.base_policies import first_moves
 from torchrl_pomdp.modules.repair.scalar.view import Tables
 
@@ -49,9 +51,7 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
     chain = np.broadcast_to(model.chain.double().numpy(), (size, levels, levels))[first]
     costs, prices = by_location(model.costs, model)[first], _prices(model)
     discounts = np.power(model.discount, np.arange(stages), dtype=np.float64)
-    powers, stage_costs, interval_costs = (
-        np.stack(each) for each in zip(*(_of_kind(*own, discounts) for own in zip(chain, costs, strict=True)), strict=True)
-    )
+    powers, stage_costs, interval_costs = _evolution(torch.from_numpy(chain), torch.from_numpy(costs), discounts)
     damage = np.zeros_like(stage_costs)
     for k in range(levels):
         # Summed as the loop sums what it does not read here.
@@ -89,16 +89,20 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
     )
 
 
-def _of_kind(
-    chain: NDArray[np.float64], costs: NDArray[np.float64], discounts: NDArray[np.float64]
+def _evolution(
+    chain: Tensor, costs: Tensor, discounts: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Powers ``[n, K, K]``, costs of a stage ``[n, K]`` and of all stages before it ``[n, K]`` of one kind of locations."""
-    powers = np.empty((len(discounts), *chain.shape))
-    powers[0] = np.eye(len(chain))
-    for n in range(1, len(discounts)):
-        powers[n] = powers[n - 1] @ chain
-    stage_costs, interval_costs = powers @ costs, np.zeros((len(discounts), len(chain)))
+    """Powers ``[J, n, K, K]``, costs of a stage ``[J, n, K]`` and of all stages before it ``[J, n, K]``, by kind of locations.
+
+    Args:
+        chain: the kinds' chains, ``[J, K, K]``.
+        costs: their costs, ``[J, K]``.
+        discounts: of the stages, ``[n]``.
+    """
+    powers = chain_powers(chain, len(discounts) - 1).movedim(0, 1)
+    stage_costs = np.ascontiguousarray(sum_first((powers * costs[:, None, None]).movedim(-1, 0)).numpy())
+    interval_costs = np.zeros_like(stage_costs)
     # What overflows is refused where it is a result.
     with np.errstate(over="ignore"):
-        interval_costs[1:] = np.cumsum(discounts[:-1, None] * stage_costs[:-1], 0)
-    return powers, stage_costs, interval_costs
+        interval_costs[:, 1:] = np.cumsum(discounts[:-1, None] * stage_costs[:, :-1], 1)
+    return np.ascontiguousarray(powers.numpy()), stage_costs, interval_costs
