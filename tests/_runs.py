@@ -20,7 +20,7 @@ def small_run(folder: Path, problem: str | Problem = "line3", **options: Any) ->
         "least_steps": 1,
         "max_steps": 20,
     }
-    numbers |= {"validation_states": 50, "visits_per_label": 0.2, "hidden": (8,), "value_hidden": (8,)}
+    numbers |= {"validation_states": 50, "visits_per_label": 0.2, "hidden": (8, 4), "value_hidden": (8,)}
     config = PolicyIterationConfig(2, **numbers)
     given = make_problem(problem) if isinstance(problem, str) else problem
     TrainingRun(given, config=config, states=20, online_states=0, **options).carry_out(folder)

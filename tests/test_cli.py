@@ -20,7 +20,7 @@ from torchrl_pomdp.trainers import load_checkpoint
 
 TINY = (
     "--iterations 1 --samples-per-part 30 --trajectories 1 --epochs 1 --least-steps 1 --batch-size 30 --max-steps 30 "
-    "--states 20 --validation-states 30 --visits-per-label 0.2 --value-samples 30 --hidden 8 --value-hidden 8"
+    "--states 20 --validation-states 30 --visits-per-label 0.2 --value-samples 30 --hidden 8 4 --value-hidden 8"
 )
 
 

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from torchrl_pomdp.controller import Controller, Decision
 from torchrl_pomdp.envs.repair import RepairModel, damage_chain, line
-from torchrl_pomdp.modules import Myopic, RolloutPolicy, ZeroCost
+from torchrl_pomdp.modules import Myopic, RolloutPolicy
 from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import make_problem, tiger
 
@@ -107,7 +107,7 @@ def test_robots_that_stand_together_must_report_the_same():
 
 def test_decisions_are_those_of_the_policy(linear20):
     model = linear20.model
-    policy = RolloutPolicy(model, GreedyRepair(model), trajectories=2, max_steps=20, terminal_cost=ZeroCost())
+    policy = RolloutPolicy(model, GreedyRepair(model), trajectories=2)
     controller = Controller(model, policy)
     y = linear20.start(torch.tensor([5]))
     controller.reset(y)
@@ -229,7 +229,7 @@ def test_illegal_controls_of_the_policy_are_refused():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_state_in_a_file_gives_the_same_decisions(dtype):
     model = RepairModel(line(4), CHAIN, (0.0, 1.0, 10.0), 0.9, num_robots=2, dtype=dtype)
-    policy = RolloutPolicy(model, GreedyRepair(model), trajectories=3, max_steps=10, terminal_cost=ZeroCost())
+    policy = RolloutPolicy(model, GreedyRepair(model), trajectories=3)
     first, second = Controller(model, policy), Controller(model, policy)
     first.reset(prior())
     first.update(("right", "right"), (1, None))

@@ -16,8 +16,8 @@ from tensordict import TensorDict
 
 from torchrl_pomdp.envs.repair import CalibratedStart, grid, line
 from torchrl_pomdp.identity import digest, identity
-from torchrl_pomdp.modules import FlatEncoder, PolicyNetwork, RolloutPolicy
-from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.modules import PolicyNetwork, RolloutPolicy
+from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.problems import make_problem
 
 
@@ -33,9 +33,9 @@ def other_default(y, n=2):
     return y + n
 
 
-def network(seed, hidden=(4,)):
+def network(seed, hidden=(4, 3)):
     model = make_problem("line3").model
-    return PolicyNetwork(FlatEncoder(model), 3, hidden, generator=torch.Generator().manual_seed(seed))
+    return PolicyNetwork(RelativeEncoder(model), 3, hidden, generator=torch.Generator().manual_seed(seed))
 
 
 # Pairs of makers of what is equal to itself and differs from the other one.
@@ -70,7 +70,7 @@ PAIRS = {
         lambda: CalibratedStart(make_problem("line3").model, observe_start=False),
     ),
     "weights": (lambda: network(0), lambda: network(1)),
-    "layers": (lambda: network(0), lambda: network(0, (4, 4))),
+    "layers": (lambda: network(0), lambda: network(0, (4,))),
     "methods": (lambda: network(0).forward, lambda: network(1).forward),
 }
 

@@ -8,6 +8,7 @@ import time
 import pytest
 from _runs import small_run
 
+from torchrl_pomdp.problems import make_problem, tiger
 from torchrl_pomdp.report.page import write_report
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -33,7 +34,9 @@ def browser():
 
 @pytest.fixture(scope="module", params=["linear20", "tiger"])
 def report(request, tmp_path_factory):
-    return write_report(small_run(tmp_path_factory.mktemp("runs") / request.param, request.param))
+    # With a smaller discount a simulation ends sooner.
+    problem = tiger(0.5) if request.param == "tiger" else make_problem(request.param)
+    return write_report(small_run(tmp_path_factory.mktemp("runs") / request.param, problem), problem=problem)
 
 
 def opened(browser, path, width=1000, scheme="light"):

@@ -68,6 +68,8 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
             "least_steps": 1,
             "visits_per_label": 0.1,
             "max_steps": 60,
+            "hidden": (8, 4),
+            "value_hidden": (8,),
         }
         return replace(settings_config(settings, problem, scale, seed), iterations=1, validation_states=20, **small)
 
@@ -78,10 +80,10 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
     )
     folders = {"runs": tmp_path / "runs", "out": tmp_path / "results"}
     told = []
-    text = reproduce(TOY, scale=0.001, base="urgency", progress=True, tell=told.append, **folders)
+    text = reproduce(TOY, scale=0.001, progress=True, tell=told.append, **folders)
     assert told[0] == text
     assert told[1].startswith("pictures: ")
-    stem = "toy-tuned-urgency-scale0.001-seed0"
+    stem = "toy-tuned-greedy-scale0.001-seed0"
     content = json.loads((tmp_path / "results" / "toy" / f"{stem}.json").read_text())
     assert content["provenance"]["versions"]["torch"] == torch.__version__
     assert content["provenance"]["commit"] == provenance()["commit"]
@@ -93,9 +95,9 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
     pictures = {path.name.removeprefix(stem) for path in (tmp_path / "results" / "toy").glob("*.png")}
     assert pictures == {"-iterations.png", "-time.png", "-line3-pAPI-NT.png", "-line3-pAPI-T.png"}
     before = (tmp_path / "results" / "toy" / f"{stem}.json").read_bytes()
-    assert reproduce(TOY, scale=0.001, base="urgency", progress=True, **folders) == text
+    assert reproduce(TOY, scale=0.001, progress=True, **folders) == text
     assert (tmp_path / "results" / "toy" / f"{stem}.json").read_bytes() == before
-    reproduce(TOY, scale=0.001, base="urgency", **folders)
+    reproduce(TOY, scale=0.001, **folders)
     labels = 40 * (6 + 9)
     # Labels of an earlier run say nothing about the time that is left.
     assert bars == [(labels, labels, 0), (labels, labels, labels), None]
@@ -169,4 +171,4 @@ def test_many_robots_are_taught_one_after_the_other():
 def test_extensions_are_run_like_the_papers_problems():
     runs = plan(EXPERIMENTS["extensions"], "tuned", "urgency", 0.01, 0)
     assert [run.problem.name for run in runs.values()] == list(EXPERIMENTS["extensions"].problems)
-    assert all(run.algorithm == "pAPI-NT" and not run.config.multiagent for run in runs.values())
+    assert all((run.algorithm, run.base, run.config.multiagent) == ("pAPI-NT", "urgency", False) for run in runs.values())

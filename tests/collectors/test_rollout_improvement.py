@@ -95,7 +95,7 @@ def test_resumes_from_its_state():
 def test_keeps_its_own_copy_of_the_policy(linear20):
     from torchrl_pomdp.modules import FlatEncoder, PolicyNetwork
 
-    network = PolicyNetwork(FlatEncoder(linear20.model), 3, (4,), generator=torch.Generator().manual_seed(0))
+    network = PolicyNetwork(FlatEncoder(linear20.model), 3, (4, 3), generator=torch.Generator().manual_seed(0))
     data = [
         RolloutImprovement(make_env(), network, states=make_states(), frames_per_batch=6, total_frames=6, label=LABEL)
         for _ in range(2)

@@ -11,7 +11,7 @@ from torchrl_pomdp.problems import Problem, make_problem
 from torchrl_pomdp.trainers import papi_nt
 
 CONFIG = PolicyIterationConfig(
-    iterations=1, samples_per_part=300, value_samples=200, validation_states=150, epochs=1, least_steps=40, max_steps=12
+    iterations=1, samples_per_part=300, value_samples=200, validation_states=150, epochs=1, least_steps=100, max_steps=12
 )
 TWICE = replace(CONFIG, iterations=2)
 

@@ -31,7 +31,7 @@ def test_maskable_ppo_learns(tmp_path):
     numbers = {"n_steps": 256, "batch_size": 64, "n_epochs": 4, "gamma": env.unwrapped.model.discount, "learning_rate": 1e-3}
     agent = sb3.MaskablePPO("MultiInputPolicy", env, seed=0, device="cpu", **numbers)
     untrained = costs(agent)
-    agent.learn(2048)
+    agent.learn(512)
     # What is saved can be played without the environment.
     agent.save(tmp_path / "agent")
     trained = costs(sb3.MaskablePPO.load(tmp_path / "agent"))

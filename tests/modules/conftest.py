@@ -7,8 +7,13 @@ import pytest
 BOTH = {"test_engine", "test_last_bit", "test_lookahead", "test_multistep", "test_parallel", "test_rollout", "test_truncation"}
 # Of these modules, tests of what tensors alone do.
 TENSORS = {
+    "test_beliefs_stay_normalised",
     "test_each_compiled_function_has_its_own_limit_of_compilations",
+    "test_float32_agrees_with_float64_over_long_runs_on_long_lines",
     "test_fused_and_eager_agree",
+    "test_labels_of_tabular_problems",
+    "test_networks_of_the_papers_size",
+    "test_outputs_of_networks",
     "test_realised_costs_with_independent_noise_make_rollout_worse_than_greedy",
     "test_without_a_compiler_it_runs_as_it_is",
 }

@@ -110,9 +110,11 @@ def test_policy_iteration_of_many_agents(name, tmp_path):
     problem = make_problem(name, partitioned=False)
     config = PolicyIterationConfig(
         iterations=2,
-        samples_per_part=120,
+        samples_per_part=60,
         least_steps=60,
-        validation_states=20,
+        visits_per_label=0.1,
+        max_steps=40,
+        validation_states=12,
         hidden=(16,),
         trajectories=2,
         multiagent=True,

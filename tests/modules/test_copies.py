@@ -38,7 +38,7 @@ CUT = {"trajectories": 2, "truncation": OnEntering((3, 4, 5)) | AfterSteps(15), 
 
 def networks():
     encoder, generator = RelativeEncoder(MODEL), torch.Generator().manual_seed(0)
-    policies = [PolicyNetwork(encoder, 3, (8,), generator=generator) for _ in range(6)]
+    policies = [PolicyNetwork(encoder, 3, (8, 5), generator=generator) for _ in range(6)]
     values = [ValueNetwork(encoder, NEVER, (8,), generator=generator) for _ in range(6)]
     return PartitionedPolicy(policies), PartitionedValue(values)
 
@@ -211,7 +211,7 @@ def test_policy_iteration_starts_from_a_rollout_policy():
         trajectories=1,
         least_steps=1,
         epochs=1,
-        hidden=(4,),
+        hidden=(4, 3),
         max_steps=8,
         visits_per_label=0.1,
         validation_states=5,

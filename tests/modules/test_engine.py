@@ -11,6 +11,7 @@ from torch._dynamo import config as dynamo_config
 from torch._dynamo.utils import counters
 from torch._inductor import config as inductor_config
 
+from torchrl_pomdp import noise
 from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, damage_chain, line
 from torchrl_pomdp.modules import (
     AfterSteps,
@@ -25,7 +26,6 @@ from torchrl_pomdp.modules.qfactors import spread
 from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.problems import tiger
-from torchrl_pomdp.problems.rocksample import rocksample
 
 
 def chain_model(size, drift=0.0, dtype=torch.float32):
@@ -73,14 +73,16 @@ def test_labels_can_be_trained_on(linear20):
     assert weight.grad is not None
 
 
-def test_fused_and_eager_agree():
+def open_when_sure(y):
+    """A policy for the tiger of few operations and without a twin, which would be compiled instead."""
+    sure, right = y["belief"].amax(-1) > 0.9, y["belief"][..., 0] > 0.5
+    return y.set("action", torch.where(sure, torch.where(right, 2, 1), 0))
+
+
+def test_fused_and_eager_agree(monkeypatch):
     """All that a step may hold: the stratified observations of several trajectories, and a rule that cuts them."""
-
-    def open_when_sure(y):
-        sure, right = y["belief"].amax(-1) > 0.9, y["belief"][..., 0] > 0.5
-        return y.set("action", torch.where(sure, torch.where(right, 2, 1), 0))
-
-    # Few operations, since to compile them takes most of the time; without a twin, which would be compiled instead.
+    # Few operations, since to compile them takes most of the time.
+    monkeypatch.setattr(noise, "ROUNDS", 2)
     model, y = tiger().model, tiger().start(torch.arange(30))
     options = {"trajectories": 3, "truncation": AfterSteps(12), "terminal_cost": ZeroCost()}
     with warnings.catch_warnings():
@@ -90,14 +92,14 @@ def test_fused_and_eager_agree():
 
 
 def test_without_a_compiler_it_runs_as_it_is():
-    problem, keys = rocksample(4, 3), torch.arange(20)
-    y, nearest = problem.start(keys), problem.base_policies["nearest"]
+    problem, keys = tiger(), torch.arange(20)
+    y = problem.start(keys)
     with (
         inductor_config.patch({"cpp.cxx": ("/no/such/compiler",), "force_disable_caches": True}),
         pytest.warns(UserWarning, match="compile=True has no effect"),
     ):
-        cost = TruncatedRollout(problem.model, nearest, compile=True)(y, keys)
-    assert torch.equal(cost, TruncatedRollout(problem.model, nearest)(y, keys))
+        cost = TruncatedRollout(problem.model, open_when_sure, compile=True)(y, keys)
+    assert torch.equal(cost, TruncatedRollout(problem.model, open_when_sure)(y, keys))
 
 
 def test_each_compiled_function_has_its_own_limit_of_compilations():

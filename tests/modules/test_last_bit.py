@@ -27,7 +27,7 @@ from torchrl_pomdp.modules import (
 )
 from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, RelativeEncoder, UrgencyRepair
 
-COUNT = 90
+COUNT = 60
 
 
 def model_of(graph, robots, dtype):
@@ -78,17 +78,21 @@ def another_way(function, y, way):
 
 
 def networks():
-    for graph, robots in ((line(7), 1), (grid(3, 3), 1), (line(5), 2)):
-        for dtype in (torch.float32, torch.float64):
-            for encoder in (FlatEncoder, RelativeEncoder):
-                for hidden in ((16, 8), (33, 1, 5)):
-                    yield pytest.param(
-                        graph, robots, dtype, encoder, hidden, id=f"{graph.name}-{dtype}-{encoder.__name__}-{hidden}"
-                    )
+    """Every pair of a graph, a precision, an encoder and layers."""
+    single, double, flat, relative = torch.float32, torch.float64, FlatEncoder, RelativeEncoder
+    for graph, robots, dtype, encoder, hidden in (
+        (line(7), 1, single, flat, (16, 8)),
+        (line(7), 1, double, relative, (33, 1, 5)),
+        (grid(3, 3), 1, single, relative, (33, 1, 5)),
+        (grid(3, 3), 1, double, flat, (16, 8)),
+        (line(5), 2, single, flat, (33, 1, 5)),
+        (line(5), 2, double, relative, (16, 8)),
+    ):
+        yield pytest.param(graph, robots, dtype, encoder, hidden, id=f"{graph.name}-{dtype}-{encoder.__name__}-{hidden}")
 
 
 @pytest.mark.parametrize(("graph", "robots", "dtype", "encoder", "hidden"), networks())
-@settings(max_examples=2, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=3, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(way=ways())
 def test_outputs_of_networks(graph, robots, dtype, encoder, hidden, way):
     model = model_of(graph, robots, dtype)
@@ -116,7 +120,7 @@ def test_networks_of_the_papers_size(linear20, way):
 def labellers(model):
     """Everything that labels states, with a base policy and a terminal cost that are networks."""
     encoder, generator = RelativeEncoder(model), torch.Generator().manual_seed(0)
-    policy = PartitionedPolicy([PolicyNetwork(encoder, model.num_controls, (9,), generator=generator) for _ in range(6)])
+    policy = PartitionedPolicy([PolicyNetwork(encoder, model.num_controls, (9, 4), generator=generator) for _ in range(6)])
     cost = PartitionedValue([ValueNetwork(encoder, NeverRepairCost(model), (9,), generator=generator) for _ in range(6)])
     cut = {"truncation": OnEntering((3, 4, 5)) | AfterSteps(6), "terminal_cost": cost, "chunk_rows": 200}
     simple = RolloutPolicy(model, GreedyRepair(model), trajectories=2, **cut)

@@ -184,7 +184,7 @@ def test_the_relaxation_closes_the_gap_sooner(linear20):
 def test_searches_improve_their_base_policy(make, linear20):
     urgency = UrgencyRepair(linear20.model)
     costs = [
-        discounted_costs(linear20.model, policy, linear20.start, num_states=60, seed=3)
+        discounted_costs(linear20.model, policy, linear20.start, num_states=25, seed=3)
         for policy in (make(linear20.model, urgency), urgency)
     ]
     assert compare(*costs).ratio.interval[1] < 1.0

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchrl_pomdp.cli import main
 from torchrl_pomdp.envs import FixedBelief, Partition, TabularModel
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.files import DamagedFileError
@@ -54,11 +55,11 @@ def model(partition=None):
     look = torch.stack([torch.tensor([0.9 - 0.08 * i, 0.1, 0.08 * i]) for i in range(LEVELS)])
     level = torch.arange(LEVELS) ** 2 / 8.0
     cost = torch.stack([level, level + 0.2, level + 3.0, level + 12.0])
-    return TabularModel(transition, torch.stack([blind, look, blind, blind]), cost, 0.9, partition=partition)
+    return TabularModel(transition, torch.stack([blind, look, blind, blind]), cost, 0.8, partition=partition)
 
 
 def start(keys):
-    return FixedBelief(torch.eye(LEVELS)[0])(keys)
+    return FixedBelief(torch.eye(LEVELS)[5])(keys)
 
 
 def threshold(y):
@@ -77,10 +78,10 @@ def single():
 own = {"__name__": "own_machine"}
 exec(compile(OWN, "own_machine.py", "exec"), own)
 CONFIG = PolicyIterationConfig(
-    iterations=2, samples_per_part=1000, value_samples=100, least_steps=500, epochs=1, hidden=(32,), value_hidden=(16,),
-    batch_size=64, validation_states=300, max_steps=40,
+    iterations=1, samples_per_part=300, value_samples=100, least_steps=200, epochs=1, hidden=(32,), value_hidden=(16,),
+    batch_size=64, validation_states=200, max_steps=25,
 )  # fmt: skip
-SMALL = replace(CONFIG, samples_per_part=60, value_samples=30, least_steps=10, validation_states=40)
+SMALL = replace(CONFIG, iterations=2, samples_per_part=40, value_samples=20, least_steps=10, validation_states=20, max_steps=15)
 
 
 def weights(iteration):
@@ -96,7 +97,7 @@ def trained():
 def test_policy_iteration_improves_a_plain_function(trained):
     problem = own["problem"]()
     best = [iteration for iteration in trained if iteration.accepted][-1]
-    costs = [discounted_costs(problem.model, p, problem.start, num_states=2000) for p in (best.policy, own["threshold"])]
+    costs = [discounted_costs(problem.model, p, problem.start, num_states=500) for p in (best.policy, own["threshold"])]
     assert compare(*costs).ratio.interval[1] < 0.95
 
 
@@ -105,14 +106,14 @@ def test_a_single_part_and_no_more_than_model_and_start():
     assert any(iteration.accepted for iteration in iterations)
     bare = Problem(own["model"](), own["start"])
     assert list(bare.base_policies) == ["myopic"]
-    (iteration, *_) = papi_nt(bare, CONFIG, bare.base_policies["myopic"])
+    (iteration, _) = papi_nt(bare, SMALL, bare.base_policies["myopic"])
     assert isinstance(iteration.policy.policies[0], PolicyNetwork)
 
 
 def test_truncated_rollout_with_its_values_is_online_play(trained):
     problem = own["problem"]()
     policy = r_t(problem, own["threshold"], trained[0].value, trajectories=2)
-    costs = [discounted_costs(problem.model, p, problem.start, num_states=100) for p in (policy, own["threshold"])]
+    costs = [discounted_costs(problem.model, p, problem.start, num_states=60) for p in (policy, own["threshold"])]
     assert costs[0].mean() < costs[1].mean()
 
 
@@ -153,7 +154,7 @@ def test_a_checkpoint_needs_the_problem_back(trained, tmp_path):
     with pytest.raises(ValueError, match=r"own\.pt: problem must be machine, as it was when .*, got another one"):
         load_checkpoint(path, problem=make_problem("tiger"))
     cheaper = TabularModel(
-        own["model"]().transition, own["model"]().observation, own["model"]().cost - 1, 0.9, partition=own["Worn"]()
+        own["model"]().transition, own["model"]().observation, own["model"]().cost - 1, 0.8, partition=own["Worn"]()
     )
     with pytest.raises(ValueError, match="got another one"):
         load_checkpoint(path, problem=Problem(cheaper, own["start"], base_policies=problem.base_policies))
@@ -162,33 +163,30 @@ def test_a_checkpoint_needs_the_problem_back(trained, tmp_path):
         load_checkpoint(path, problem=own["problem"]())
 
 
-def test_the_command_trains_and_evaluates_it_in_fresh_processes(tmp_path):
+def test_the_command_trains_it_in_a_fresh_process_and_evaluates_it_in_another(tmp_path, monkeypatch, capsys):
     (tmp_path / "own_machine.py").write_text(OWN)
-
-    def command(*words):
-        done = subprocess.run(
-            [sys.executable, "-m", "torchrl_pomdp.cli", *words], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout + done.stderr
-
-    numbers = ["--iterations", "1", "--samples-per-part", "100", "--least-steps", "50", "--hidden", "16", "--max-steps", "8"]
+    numbers = ["--iterations", "1", "--samples-per-part", "40", "--least-steps", "10", "--hidden", "16", "--max-steps", "8"]
     numbers += ["--states", "8", "--validation-states", "8", "--online-states", "0"]
-    told = command("train", "own_machine:problem", "--out", "run", *numbers)
-    assert "threshold: 1.000 of threshold" in told
-    assert "machine: TabularModel: 10 states, 4 controls, 3 observations, discount 0.9; 8 start states" in command(
-        "evaluate", "run/best.pt", "--problem", "own_machine:problem", "--states", "8"
-    )
+    command = [sys.executable, "-m", "torchrl_pomdp.cli", "train", "own_machine:problem", "--out", "run", *numbers]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "threshold: 1.000 of threshold" in done.stdout + done.stderr
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["evaluate", "run/best.pt", "--problem", "own_machine:problem", "--states", "8"]) == 0
+    del sys.modules["own_machine"]
+    evaluated = "machine: TabularModel: 10 states, 4 controls, 3 observations, discount 0.8; 8 start states"
+    assert evaluated in capsys.readouterr().out
 
 
 def test_a_run_of_it_has_a_folder_of_its_own(tmp_path):
-    config = PolicyIterationConfig(1, samples_per_part=40, least_steps=1, validation_states=50, max_steps=20)
-    run = TrainingRun(own["problem"](), config=config, states=20, online_states=0)
+    config = PolicyIterationConfig(1, samples_per_part=20, least_steps=1, validation_states=20, max_steps=10)
+    run = TrainingRun(own["problem"](), config=config, states=8, online_states=0)
     assert list(run.carry_out(tmp_path / "run")) == ["threshold", "R-NT of threshold", "pAPI-NT 1"]
     best = load_checkpoint(tmp_path / "run" / "best.pt", problem=own["problem"]())
     assert best.problem.name == "machine"
     with pytest.raises(ValueError, match=r"differs in .*problem"):
-        TrainingRun(make_problem("tiger"), "API", config=config, states=20, online_states=0).carry_out(tmp_path / "run")
+        TrainingRun(make_problem("tiger"), "API", config=config, states=8, online_states=0).carry_out(tmp_path / "run")
 
 
 def test_what_a_problem_must_be():

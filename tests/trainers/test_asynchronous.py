@@ -20,7 +20,15 @@ from torchrl_pomdp.trainers.run import TrainingRun
 from torchrl_pomdp.workers import LocalWorkers
 
 CONFIG = PolicyIterationConfig(
-    iterations=2, samples_per_part=60, value_samples=40, validation_states=60, epochs=1, least_steps=10
+    iterations=2,
+    samples_per_part=60,
+    value_samples=40,
+    validation_states=60,
+    epochs=1,
+    least_steps=10,
+    hidden=(16, 8),
+    value_hidden=(16,),
+    max_steps=40,
 )
 
 
@@ -59,12 +67,6 @@ def test_every_part_publishes_every_version(line3, recipe):
         assert iterations[-1].policy(y)["action"].shape == (5,)
 
 
-def test_without_staleness_all_versions_are_made_from_those_before(line3):
-    run = asynchronously(line3, staleness=0)
-    list(run)
-    assert all(min(version.used) >= version.number - 1 for version in run.published)
-
-
 def test_the_best_policy_is_one_that_was_accepted(line3):
     """Hardly any training makes networks that are worse than a near-optimal base policy."""
     run = asynchronously(line3, base=UrgencyRepair)
@@ -72,7 +74,7 @@ def test_the_best_policy_is_one_that_was_accepted(line3):
     assert run.best is run.run.base_policy
 
 
-def test_parts_visit_with_the_freshest_networks(line3, monkeypatch):
+def test_without_staleness_parts_wait_and_visit_with_the_freshest_networks(line3, monkeypatch):
     """Each part makes its share of the visits before it labels for a version after the first."""
     run, visits = asynchronously(line3, staleness=0), []
     visit = run.run.memory.visit.__func__
@@ -83,6 +85,7 @@ def test_parts_visit_with_the_freshest_networks(line3, monkeypatch):
 
     monkeypatch.setattr(StateMemory, "visit", seen)
     first, _ = run
+    assert all(min(version.used) >= version.number - 1 for version in run.published)
     assert visits[0][0] is run.run.base_policy
     assert len(visits) == 7
     assert all(isinstance(network, LocalNetwork) for policy, _ in visits[1:] for network in policy.policies)

@@ -49,7 +49,7 @@ def weights(policy):
 
 
 def test_it_learns_the_line_of_3(line3):
-    policy = ppo(line3, steps=16 * BATCH)
+    policy = ppo(line3, steps=12 * BATCH)
     cost, _ = line3_cost(line3.model, policy)
     assert LINE3_OPTIMUM[0] - 0.01 < cost < 1.01 * LINE3_OPTIMUM[1]
 

@@ -86,6 +86,8 @@ def check_belief_model(model: BeliefModel, generator: StateGenerator, *, seed: i
 
 
 def _check_attributes(model: BeliefModel) -> None:
+    mend = "Call super().__init__(discount) first."
+    require(hasattr(model, "discount"), "__init__", "it calls that of BeliefModel", "a model without a discount", mend)
     for name in ("num_controls", "num_observations", "noise_dim"):
         value = getattr(model, name, None)
         right = isinstance(value, int) and value >= 1
