@@ -7,6 +7,7 @@ import warnings
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch._dynamo import config as dynamo_config
 from torch._dynamo.utils import counters
 from torch._inductor import config as inductor_config
@@ -24,6 +25,7 @@ from torchrl_pomdp.modules import (
 from torchrl_pomdp.modules.compiling import compiled
 from torchrl_pomdp.modules.qfactors import spread
 from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
+from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.problems import tiger
 
@@ -83,12 +85,19 @@ def test_fused_and_eager_agree(monkeypatch):
     """All that a step may hold: the stratified observations of several trajectories, and a rule that cuts them."""
     # Few operations, since to compile them takes most of the time.
     monkeypatch.setattr(noise, "ROUNDS", 2)
-    model, y = tiger().model, tiger().start(torch.arange(30))
+    model, left = tiger().model, torch.linspace(0.1, 0.9, 30)
+    y = TensorDict({"belief": torch.stack([left, 1 - left], -1)}, [30])
     options = {"trajectories": 3, "truncation": AfterSteps(12), "terminal_cost": ZeroCost()}
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="compile=True")
-        fast = RolloutPolicy(model, open_when_sure, compile=True, **options).q_factors(y)
-    torch.testing.assert_close(fast, RolloutPolicy(model, open_when_sure, **options).q_factors(y), rtol=1e-5, atol=1e-3)
+    # Nothing is observed yet, as in a leaf something is.
+    number = torch.arange(30)
+    scenarios = Scenarios(number, number // 3, number % 3, torch.zeros_like(number))
+    found = []
+    for fused in (True, False):
+        policy = RolloutPolicy(model, open_when_sure, compile=fused, **options)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message="compile=True")
+            found.append((policy.q_factors(y), policy.cost_to_go(y, scenarios, 3)))
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-3)
 
 
 def test_without_a_compiler_it_runs_as_it_is():
@@ -177,7 +186,6 @@ def test_adaptive_labels_do_not_depend_on_the_batch(linear20):
 
 def test_adaptive_allocation_with_exact_first_observations():
     y = {"belief": torch.tensor([[0.5, 0.5], [0.97, 0.03]])}
-    from tensordict import TensorDict
 
     def listen(y):
         return y.set("action", torch.zeros(y.batch_size, dtype=torch.int64))

@@ -209,6 +209,11 @@ class FewNames(Machine):
     control_names = ("run", "inspect")
 
 
+class Uninitialised(Machine):
+    def __init__(self):
+        pass
+
+
 class Negative(Machine):
     def observed(self, y, u):
         return super().observed(y, u) - 1
@@ -236,6 +241,7 @@ BROKEN = {
     StaleMask: "estimator: action_mask is a function of the core",
     LooseSpec: r"state_spec: the shape of 'belief' is the batch \(7,\)",
     Cheap: "max_cost: no stage cost is larger than max_cost, 4.5",
+    Uninitialised: r"__init__: it calls that of BeliefModel; .* Call super\(\).__init__\(discount\) first",
     FewNames: "control_names: it is None or a tuple of 3 different names; found",
     Negative: "observed: names of hidden variables are not negative",
 }
