@@ -113,7 +113,7 @@ CUT = {"max_steps": 6, "terminal_cost": NeverRepairCost(PROBLEM.model)}
 
 
 def network(seed):
-    return PolicyNetwork(FlatEncoder(PROBLEM.model), 3, (4,), generator=torch.Generator().manual_seed(seed))
+    return PolicyNetwork(FlatEncoder(PROBLEM.model), 3, (4, 3), generator=torch.Generator().manual_seed(seed))
 
 
 def collector(cache, kind=RolloutImprovement, policy=None, states_seed=0, size=10, told=None, **label):

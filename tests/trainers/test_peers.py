@@ -22,7 +22,7 @@ LEARNT = ["R-T of urgency", "pAPI-NT 1", "pAPI-NT 1 + R-NT"]
 
 @pytest.fixture(scope="module")
 def checkpoint(line3):
-    config = PolicyIterationConfig(hidden=(8,), value_hidden=(8,))
+    config = PolicyIterationConfig(hidden=(8, 5), value_hidden=(8,))
     policy = make_networks(line3, config, 0).eval()
     value = PartitionedValue(list(make_values(line3, config, 0).values)).eval()
     return Checkpoint(line3, config, "pAPI-NT", 1, policy, value)
