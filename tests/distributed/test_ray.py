@@ -32,8 +32,8 @@ DRIVER = os.getpid()
 
 @pytest.fixture(scope="module")
 def cluster():
-    """A cluster of two CPUs, which the tests' workers share."""
-    with RayWorkers(num_workers=2) as workers:
+    """A cluster of three CPUs, which the tests' workers share."""
+    with RayWorkers(num_workers=3) as workers:
         yield workers
 
 
@@ -55,7 +55,7 @@ def with_values():
 
 
 def test_synchronous_is_local_to_the_last_bit(cluster, small, tmp_path, with_values):
-    assert cluster.num_workers == 2
+    assert cluster.num_workers == 3
     assert_same(carried_out(cluster, papi_t, config=TWICE, folder=tmp_path / "run"), with_values)
     restored = carried_out(LOCAL, papi_t, config=TWICE, folder=tmp_path / "run")
     assert_same(restored, with_values)
@@ -206,7 +206,7 @@ def interrupted(arguments, iteration, how):
 
 
 def test_a_killed_driver_goes_on(cluster, tmp_path, with_values):
-    """The first iteration is one worker's, and the second one partly, which two others finish."""
+    """The first iteration is one worker's, and the second one partly, which three others finish."""
     folder = tmp_path / "run"
     interrupted(("-c", SCRIPT, str(folder)), folder / "iteration-2", signal.SIGKILL)
     assert (folder / "iteration-1/3-improve.pt").exists()
@@ -296,7 +296,7 @@ def test_what_was_released_does_nothing_more(cluster):
 
 def test_a_running_cluster_has_the_workers_that_it_has(cluster):
     with RayWorkers() as same:
-        assert same.num_workers == 2
+        assert same.num_workers == 3
     with pytest.raises(ValueError, match="num_workers is for a cluster that is started here, got 2 for one that is running"):
         RayWorkers(num_workers=2)
     assert list(cluster.tasks(lambda shared, item: (item, item), None, [1], str)), "the cluster is still there"
