@@ -15,7 +15,7 @@ from torchrl_pomdp.evaluation import discounted_costs
 from torchrl_pomdp.modules import PartitionedPolicy, PolicyNetwork
 from torchrl_pomdp.problems import Problem
 from torchrl_pomdp.trainers import ppo
-from torchrl_pomdp.trainers.ppo import BATCH, Training, seeded
+from torchrl_pomdp.trainers.ppo import BATCH, Training
 
 DISCOUNT = 0.9
 
@@ -35,13 +35,12 @@ def trained(line3):
 
 def first_batch(problem, ratio=None):
     """A training and its first batch; with ``ratio`` the value of every state is that multiple of the pessimistic cost."""
-    with seeded(problem.model.device, 0):
-        training = Training(problem, 1, 0)
-        if ratio is not None:
-            last = list(training.value.network)[-1]
-            nn.init.zeros_(last.weight)
-            nn.init.constant_(last.bias, ratio)
-        return training, next(iter(training.batches()))
+    training = Training(problem, 1, 0)
+    if ratio is not None:
+        last = list(training.value.network)[-1]
+        nn.init.zeros_(last.weight)
+        nn.init.constant_(last.bias, ratio)
+    return training, next(iter(training.segment()))
 
 
 def weights(policy):
@@ -94,6 +93,40 @@ def test_a_seed_decides_the_weights_and_the_global_generator_is_untouched(line3,
 
 def test_a_last_batch_that_is_not_full_is_left_out(line3, trained):
     assert torch.equal(weights(ppo(line3, steps=2 * BATCH - 1)), weights(trained))
+
+
+def test_an_interrupted_training_goes_on_where_it_was(line3, monkeypatch, tmp_path):
+    monkeypatch.setattr(sys.modules[Training.__module__], "SEGMENT", 2)
+    options = {"steps": 7 * 16 * 64, "episodes": 64}
+    whole, path = weights(ppo(line3, **options)), tmp_path / "ppo.pt"
+    made, own = [], Training.update
+
+    def update(training, batch):
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        made.append(training.done)
+        own(training, batch)
+
+    monkeypatch.setattr(Training, "update", update)
+    with pytest.raises(KeyboardInterrupt):
+        ppo(line3, path=path, **options)
+    made.clear()
+    with pytest.raises(KeyboardInterrupt):
+        ppo(line3, path=path, **options)
+    # The third batch, of a segment that was not over, is made again.
+    assert made == [2, 3, 4]
+    made.clear()
+    assert torch.equal(weights(ppo(line3, path=path, **options)), whole)
+    assert made == [4, 5, 6]
+    made.clear()
+    assert torch.equal(weights(ppo(line3, path=path, **options)), whole)
+    assert made == []
+
+
+def test_a_file_of_another_training_is_not_used(line3, trained, tmp_path):
+    path = tmp_path / "ppo.pt"
+    ppo(line3, steps=BATCH, seed=1, path=path)
+    assert torch.equal(weights(ppo(line3, steps=BATCH, path=path)), weights(trained))
 
 
 def test_what_follows_a_cut_is_the_value_of_the_state_there(treadmill):
@@ -158,6 +191,9 @@ def test_first_episodes_are_cut_at_different_times(treadmill):
         ({"steps": BATCH - 1}, ValueError, f"steps must be at least {BATCH}, got {BATCH - 1}"),
         ({"steps": 1e6}, TypeError, "steps must be an integer, got 1000000.0"),
         ({"seed": -1}, ValueError, "seed must be at least 0, got -1"),
+        ({"episodes": 0}, ValueError, "episodes must be at least 1, got 0"),
+        ({"episodes": 257}, ValueError, "steps must be at least 4112, got 4096"),
+        ({"path": 1}, TypeError, "path must be"),
         ({"progress": 1}, TypeError, "progress must be True or False, got 1"),
         ({"problem": "line3"}, TypeError, "problem must be a Problem, got 'line3'"),
     ],

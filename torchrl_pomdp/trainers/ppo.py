@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import cast
+from os import PathLike
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -19,31 +20,45 @@ from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from torchrl_pomdp.checks import check_flag, check_instance, check_integer, check_seed
+from torchrl_pomdp.checks import check_flag, check_instance, check_integer, check_path, check_seed
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.belief_env import BeliefEnv
+from torchrl_pomdp.identity import digest
+from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import PolicyNetwork, ValueNetwork
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.threads import kept_threads
+from torchrl_pomdp.noise import fold
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.trainers.architecture import make_networks, make_values
+from torchrl_pomdp.trainers.checkpoint import problem_digest
 
 __all__ = ["ppo"]
 
 # Episodes side by side, and stages of each between two updates.
 _EPISODES, _STAGES = 256, 16
 BATCH = _EPISODES * _STAGES
-_MOST = 10**12
+_MOST, _MOST_EPISODES = 10**12, 1 << 20
+# Updates between two beginnings of new episodes, where a training can go on after an interruption.
+SEGMENT = 64
 
-_EPOCHS, _MINIBATCH = 4, 512
+_EPOCHS, _MINIBATCHES = 4, 8
 _LEARNING_RATE, _LARGEST_GRADIENT = 5e-4, 0.5
 _CLIP, _LAMBDA, _ENTROPY = 0.2, 0.95, 0.02
 # The last layers begin that much smaller: a nearly uniform policy, and values near zero, whose noise would drown stage costs.
 _SHRINK = 0.01
 
 
-def ppo(problem: Problem, *, steps: int, seed: int = 0, progress: bool = False) -> PolicyNetwork:
+def ppo(
+    problem: Problem,
+    *,
+    steps: int,
+    seed: int = 0,
+    episodes: int = _EPISODES,
+    path: str | PathLike[str] | None = None,
+    progress: bool = False,
+) -> PolicyNetwork:
     r"""Train a policy by proximal policy optimisation (Schulman et al., 2017) on the belief steps of its own trajectories.
 
     Rewards are minus expected stage costs; controls are drawn from a softmax over the legal ones. An episode ends in a terminal
@@ -53,13 +68,14 @@ def ppo(problem: Problem, *, steps: int, seed: int = 0, progress: bool = False) 
     number: advantages and the targets of values are taken in multiples of their state's pessimistic cost, as by
     :class:`~torchrl_pomdp.objectives.ValueLoss`.
 
-    256 episodes run side by side. After every 16 stages an update makes 4 passes over these 4096 steps in minibatches of 512,
-    by Adam with a step size that falls from 0.0005 to 0, gradients of norm 0.5 at most, ratios clipped at 0.2, advantages with
-    :math:`\lambda=0.95`, and an entropy bonus that falls from 0.02 to 0. The networks are those of the default
-    :class:`~torchrl_pomdp.trainers.PolicyIterationConfig` with the problem's encoder, one of each for all parts. The seed alone
-    decides the result; PyTorch's global generators are left as they were. With seed 0, 65 536 steps come within 0.2 % of the
-    optimum on ``line3``; on ``linear20`` a million steps cost 0.946 and two million 0.899 of what the greedy policy costs, from
-    500 start states, with standard errors of 0.004. On ``tiger`` 100 000 steps only learn to listen.
+    After every 16 stages of all episodes an update makes 4 passes over their steps in 8 minibatches, by Adam with a step size
+    that falls from 0.0005 to 0, gradients of norm 0.5 at most, ratios clipped at 0.2, advantages with :math:`\lambda=0.95`, and
+    an entropy bonus that falls from 0.02 to 0. After 64 updates all episodes begin anew. The networks are those of the default
+    :class:`~torchrl_pomdp.trainers.PolicyIterationConfig` with the problem's encoder, one of each for all parts. The arguments
+    decide the result, however often the training was interrupted; PyTorch's global generators are left as they were. With seed
+    0, 65 536 steps come within 0.2 % of the optimum on ``line3``; on ``linear20`` a million steps cost 0.946 and two million
+    0.899 of what the greedy policy costs, from 500 start states, with standard errors of 0.004. On ``tiger`` 100 000 steps only
+    learn to listen.
 
     Args:
         problem: the problem; its partition is not used.
@@ -67,6 +83,8 @@ def ppo(problem: Problem, *, steps: int, seed: int = 0, progress: bool = False) 
     Keyword Args:
         steps: belief steps of all episodes together; a last batch that is not full is left out.
         seed: seed of weights, start states, observations, controls and minibatches.
+        episodes: episodes side by side. More make larger updates and fewer of them, which an accelerator wants.
+        path: file where the training is kept after every 64 updates, and from which it goes on; None: it is not kept.
         progress: whether to show a progress bar with the rate.
 
     Returns:
@@ -75,7 +93,7 @@ def ppo(problem: Problem, *, steps: int, seed: int = 0, progress: bool = False) 
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if there are fewer than 4096 steps, or the seed is out of range.
+        ValueError: if there are fewer than 16 steps of each episode, or a number is out of range.
 
     Examples:
         >>> from torchrl_pomdp.evaluation import discounted_costs
@@ -87,15 +105,29 @@ def ppo(problem: Problem, *, steps: int, seed: int = 0, progress: bool = False) 
     """
     problem = check_instance("problem", problem, Problem).unpartitioned()
     problem.model.check_enumerable("ppo", "trainers.api, whose network agents share")
-    steps, seed = check_integer("steps", steps, BATCH, _MOST), check_seed("seed", seed)
-    batches = steps // BATCH
-    bar = progress_bar(batches * BATCH, "step", "PPO", check_flag("progress", progress))
+    episodes = check_integer("episodes", episodes, 1, _MOST_EPISODES)
+    size = episodes * _STAGES
+    steps, seed = check_integer("steps", steps, size, _MOST), check_seed("seed", seed)
+    path = None if path is None else check_path("path", path)
+    batches = steps // size
+    owner = digest([problem_digest(problem), batches, seed, episodes])
+    training = Training(problem, batches, seed, episodes)
+    content = None if path is None else kept(path, owner)
+    if content is not None:
+        training.load_state_dict(content)
+    bar = progress_bar(batches * size, "step", "PPO", check_flag("progress", progress))
     # Sums of gradients would depend on the number of threads.
-    with bar, seeded(problem.model.device, seed), kept_threads(1):
-        training = Training(problem, batches, seed)
-        for batch in training.batches():
-            training.update(batch)
-            bar.update(BATCH)
+    with bar, kept_threads(1):
+        if not bar.disable:
+            # What is done already says nothing about the rate.
+            bar.initial = training.done * size
+            bar.update(training.done * size)
+        while training.done < batches:
+            for batch in training.segment():
+                training.update(batch)
+                bar.update(size)
+            if path is not None:
+                keep(path, owner, training.state_dict())
     return training.policy.eval()
 
 
@@ -118,17 +150,18 @@ class Training:
         problem: a problem of a single part.
         count: number of batches.
         seed: seed of weights and environment.
+        episodes: episodes side by side.
     """
 
-    def __init__(self, problem: Problem, count: int, seed: int) -> None:
+    def __init__(self, problem: Problem, count: int, seed: int, episodes: int = _EPISODES) -> None:
         model, config = problem.model, PolicyIterationConfig()
+        self.problem, self.count, self.seed, self.episodes = problem, count, seed, episodes
+        self.done = 0
         self.policy = cast(PolicyNetwork, make_networks(problem, config, seed).policies[0])
         self.value = cast(ValueNetwork, make_values(problem, config, seed, self.policy.encoder).values[0])
         for network in (self.policy, self.value):
             _shrink(network)
         self.actor = self.policy.actor()
-        env = BeliefEnv(model, problem.start, batch_size=(_EPISODES,), seed=seed)
-        self.env = TransformedEnv(env, _SpreadCounter(max_steps=model.horizon))
         self.advantage = GAE(
             gamma=model.discount, lmbda=_LAMBDA, value_network=_Critic(self.value), deactivate_vmap=True, device=model.device
         )
@@ -143,35 +176,52 @@ class Training:
         )
         self.parameters = list(self.loss.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, _LEARNING_RATE)
-        self.schedule = torch.optim.lr_scheduler.LinearLR(self.optimizer, 1.0, 0.0, total_iters=count)
-        self.count = count
 
-    def batches(self) -> Iterator[TensorDictBase]:
-        """Steps of the policy as it is, ``[episodes, stages]``."""
-        collector = Collector(
-            self.env,
-            self.actor,
-            frames_per_batch=BATCH,
-            total_frames=self.count * BATCH,
-            auto_register_policy_transforms=False,
-        )
-        try:
-            yield from collector
-        finally:
-            collector.shutdown()
+    def state_dict(self) -> dict[str, Any]:
+        """What a training that goes on needs, between two segments."""
+        moments = {str(number): each for number, each in self.optimizer.state_dict()["state"].items()}
+        return {"policy": self.policy.state_dict(), "value": self.value.state_dict(), "moments": moments, "done": self.done}
+
+    def load_state_dict(self, content: dict[str, Any]) -> None:
+        """Go on with a training that was kept."""
+        self.policy.load_state_dict(content["policy"])
+        self.value.load_state_dict(content["value"])
+        moments = {int(number): each for number, each in content["moments"].items()}
+        self.optimizer.load_state_dict(self.optimizer.state_dict() | {"state": moments})
+        self.done = content["done"]
+
+    def segment(self) -> Iterator[TensorDictBase]:
+        """Steps of the policy as it is, ``[episodes, stages]``, of new episodes, until these end or all batches are made."""
+        model, left, number = self.problem.model, min(SEGMENT, self.count - self.done), self.done // SEGMENT
+        seed = int(fold(torch.tensor(self.seed), number)) & (2**63 - 1) if number else self.seed
+        env = BeliefEnv(model, self.problem.start, batch_size=(self.episodes,), seed=seed)
+        with seeded(model.device, seed):
+            collector = Collector(
+                TransformedEnv(env, _SpreadCounter(max_steps=model.horizon)),
+                self.actor,
+                frames_per_batch=self.episodes * _STAGES,
+                total_frames=left * self.episodes * _STAGES,
+                auto_register_policy_transforms=False,
+            )
+            try:
+                yield from collector
+            finally:
+                collector.shutdown()
 
     def update(self, batch: TensorDictBase) -> None:
         """Improve both networks on a batch."""
+        remaining = 1.0 - self.done / self.count
+        self.optimizer.param_groups[0]["lr"] = remaining * _LEARNING_RATE
+        self.loss.entropy_coeff.fill_(remaining * _ENTROPY)
         rows = self.labelled(batch)
         for _ in range(_EPOCHS):
-            for chosen in torch.randperm(len(rows), device=rows.device).split(_MINIBATCH):
+            for chosen in torch.randperm(len(rows), device=rows.device).chunk(_MINIBATCHES):
                 losses = self.loss(rows[chosen])
                 self.optimizer.zero_grad()
                 (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
                 nn.utils.clip_grad_norm_(self.parameters, _LARGEST_GRADIENT)
                 self.optimizer.step()
-        self.schedule.step()
-        self.loss.entropy_coeff.fill_(_ENTROPY * self.schedule.get_last_lr()[0] / _LEARNING_RATE)
+        self.done += 1
 
     def labelled(self, batch: TensorDictBase) -> TensorDictBase:
         """The steps ``[N]`` with advantages and targets of values, in multiples of the states' pessimistic costs."""
