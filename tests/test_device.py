@@ -14,7 +14,7 @@ from torchrl_pomdp.modules import PartitionedPolicy, PolicyNetwork, RolloutPolic
 from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.objectives import ClassificationLoss
 from torchrl_pomdp.problems import make_problem
-from torchrl_pomdp.trainers import PolicyIterationConfig, papi_nt, papi_t
+from torchrl_pomdp.trainers import PolicyIterationConfig, papi_nt, papi_t, ppo
 from torchrl_pomdp.trainers.checkpoint import problem_digest
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -96,3 +96,20 @@ def test_policy_iteration_trains_there():
 @pytest.mark.parametrize("name", ["linear20", "two_robots20", "rocksample7x8"])
 def test_a_problem_is_the_same_there(name):
     assert problem_digest(make_problem(name, device="cuda")) == problem_digest(make_problem(name))
+
+
+def test_feature_states_need_not_say_where_they_are():
+    problem = make_problem("linear20", device="cuda")
+    y = problem.start(torch.arange(40, device="cuda"))
+    network = PolicyNetwork(RelativeEncoder(problem.model), 3, (16,), generator=torch.Generator(device="cuda").manual_seed(0))
+    for policy in (network, PartitionedPolicy([network] * 6), GreedyRepair(problem.model)):
+        rollout = RolloutPolicy(problem.model, policy, trajectories=2)
+        silent = problem.model.with_features(y).clone().clear_device_()
+        assert silent.device is None
+        for each in (policy, rollout):
+            assert torch.equal(each(silent.clone())["action"], each(problem.model.with_features(y).clone())["action"])
+
+
+def test_ppo_trains_there():
+    policy = ppo(make_problem("linear20", device="cuda"), steps=4096)
+    assert all(parameter.is_cuda and torch.isfinite(parameter).all() for parameter in policy.parameters())

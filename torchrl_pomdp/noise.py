@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_integer
-from torchrl_pomdp.tensor_checks import check_keys
+from torchrl_pomdp.tensor_checks import check_keys, device_of
 
 __all__ = ["fingerprint", "fold", "permuted", "seed_keys", "uniform"]
 
@@ -146,7 +146,7 @@ def fingerprint(y: TensorDictBase) -> Tensor:
         >>> torch.equal(fingerprint(y)[2:5], fingerprint(y[2:5]))
         True
     """
-    total = torch.zeros(y.batch_size, dtype=torch.int64, device=y.device)
+    total = torch.zeros(y.batch_size, dtype=torch.int64, device=device_of(y))
     offset = 0
     for key in sorted(y.keys(include_nested=True, leaves_only=True), key=str):
         leaf = y.get(key)

@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Categorical, TensorSpec
 
 from torchrl_pomdp.checks import shown
 
-__all__ = ["check_device", "check_distributions", "check_dtype", "check_entries", "check_keys", "check_tensor"]
+__all__ = ["check_device", "check_distributions", "check_dtype", "check_entries", "check_keys", "check_tensor", "device_of"]
 
 # How far the sum of probabilities may be from one: rounding in long products of float32 numbers.
 SUM_TOLERANCE = 1e-4
@@ -199,3 +199,17 @@ def bounds_text(leaf: TensorSpec) -> str:
     if isinstance(leaf, Bounded):
         return f"{leaf.space.low.min():g} to {leaf.space.high.max():g}"
     return " ".join(str(leaf).split())
+
+
+def device_of(y: TensorDictBase) -> torch.device:
+    """Where the entries of ``y`` are. A TensorDict need not say so itself; TorchRL's collectors make such.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> y = TensorDict({"belief": torch.zeros(2, device="meta")}, [2])
+        >>> y.device, device_of(y)
+        (None, device(type='meta'))
+    """
+    if y.device is not None:
+        return y.device
+    return next((leaf.device for leaf in y.values(include_nested=True, leaves_only=True)), torch.device("cpu"))

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_sequence, check_text, shown
-from torchrl_pomdp.tensor_checks import check_entries
+from torchrl_pomdp.tensor_checks import check_entries, device_of
 
 __all__ = ["FunctionPartition", "Partition", "SinglePart"]
 
@@ -77,7 +77,7 @@ class SinglePart(Partition):
     def forward(self, y: TensorDictBase) -> Tensor:
         """Zeros, int64 ``[*B]``."""
         check_entries("y", y, ())
-        return torch.zeros(y.batch_size, dtype=torch.int64, device=y.device)
+        return torch.zeros(y.batch_size, dtype=torch.int64, device=device_of(y))
 
 
 class FunctionPartition(Partition):

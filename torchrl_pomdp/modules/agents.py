@@ -21,7 +21,7 @@ from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.networks import LocalNetwork, check_finite_output
 from torchrl_pomdp.modules.rowwise import RowLinear, product, rowwise
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine
-from torchrl_pomdp.tensor_checks import check_entries
+from torchrl_pomdp.tensor_checks import check_entries, device_of
 
 __all__ = ["AgentEncoder", "AgentNetwork", "FlatAgentEncoder"]
 
@@ -79,15 +79,15 @@ class FlatAgentEncoder(AgentEncoder):
 
     def own_features(self, y: TensorDictBase) -> Tensor:
         """None."""
-        return torch.empty(y.batch_size[0], self.model.num_agents, 0, dtype=self.dtype, device=y.device)
+        return torch.empty(y.batch_size[0], self.model.num_agents, 0, dtype=self.dtype, device=device_of(y))
 
     def own_marks(self, y: TensorDictBase) -> Tensor:
         """The number of the agent."""
-        return torch.arange(self.model.num_agents, device=y.device).view(1, -1, 1).expand(y.batch_size[0], -1, -1)
+        return torch.arange(self.model.num_agents, device=device_of(y)).view(1, -1, 1).expand(y.batch_size[0], -1, -1)
 
     def choice_marks(self, y: TensorDictBase, agents: slice, controls: Tensor) -> Tensor:
         """The agent together with its control."""
-        which = torch.arange(self.model.num_agents, device=y.device)[agents]
+        which = torch.arange(self.model.num_agents, device=device_of(y))[agents]
         return (self.model.num_agents + which * self.model.num_agent_controls + controls).unsqueeze(-1)
 
 

@@ -14,7 +14,7 @@ from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.tabular import TabularModel
 from torchrl_pomdp.modules.rollout import Policy, controls_of
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, offer_engines
-from torchrl_pomdp.tensor_checks import check_entries
+from torchrl_pomdp.tensor_checks import check_entries, device_of
 
 __all__ = ["Myopic", "as_policy"]
 
@@ -55,7 +55,7 @@ class Myopic(TensorDictModuleBase):
         """Write ``"action"``, int64 ``[*B]``."""
         y = check_entries("tensordict", tensordict, self.in_keys)
         every = range(self.model.num_controls)
-        costs = torch.stack([self.model.expected_cost(y, torch.full(y.batch_size, u, device=y.device)) for u in every], -1)
+        costs = torch.stack([self.model.expected_cost(y, torch.full(y.batch_size, u, device=device_of(y))) for u in every], -1)
         # argmin may give any of equal ones; the first is asked for.
         costs = costs.masked_fill(~self.model.action_mask(y), torch.inf)
         least = costs == costs.amin(-1, keepdim=True)

@@ -18,7 +18,7 @@ from torchrl_pomdp.modules.encoders import Encoder, transformed
 from torchrl_pomdp.modules.rowwise import RowLinear, rowwise
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, local_engine
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
-from torchrl_pomdp.tensor_checks import check_entries
+from torchrl_pomdp.tensor_checks import check_entries, device_of
 
 if TYPE_CHECKING:
     from torchrl.modules import ProbabilisticActor
@@ -59,7 +59,7 @@ class LocalNetwork(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the ``out_keys`` for feature states ``[*B]``."""
         flat = flat_rows(check_entries("tensordict", tensordict, self.in_keys).select(*self.in_keys))
-        rows = torch.arange(flat.batch_size[0], device=flat.device)
+        rows = torch.arange(flat.batch_size[0], device=device_of(flat))
         entries = evaluate_networks([self], flat, rows, [rows.numel()])
         return tensordict.update(entries.reshape(tensordict.batch_size))
 

@@ -18,6 +18,7 @@ from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold
+from torchrl_pomdp.tensor_checks import device_of
 
 __all__ = ["ClosedFormCost", "ConstantCost", "PolicyCost", "ZeroCost"]
 
@@ -67,7 +68,7 @@ class ConstantCost(ClosedFormCost):
     def costs(self, y: TensorDictBase) -> Tensor:
         """The number, ``[*B]``."""
         check_instance("y", y, TensorDictBase)
-        return torch.full(y.batch_size, self.cost, dtype=self.dtype, device=y.device)
+        return torch.full(y.batch_size, self.cost, dtype=self.dtype, device=device_of(y))
 
 
 class ZeroCost(ClosedFormCost):
@@ -84,7 +85,7 @@ class ZeroCost(ClosedFormCost):
     def costs(self, y: TensorDictBase) -> Tensor:
         """Zeros ``[*B]`` of the type of the state's floating entries."""
         kinds = [leaf.dtype for leaf in check_instance("y", y, TensorDictBase).values() if leaf.is_floating_point()]
-        return torch.zeros(y.batch_size, dtype=kinds[0] if kinds else None, device=y.device)
+        return torch.zeros(y.batch_size, dtype=kinds[0] if kinds else None, device=device_of(y))
 
 
 class PolicyCost(TensorDictModuleBase):
@@ -169,7 +170,7 @@ class PolicyCost(TensorDictModuleBase):
         """Costs ``[N]`` of a flat batch."""
         count = self.trajectories
         groups = fold(self.model.fingerprint(y), self.seed).repeat(count)
-        members = torch.arange(count, device=y.device).repeat_interleave(y.shape[0])
+        members = torch.arange(count, device=device_of(y)).repeat_interleave(y.shape[0])
         scenarios = Scenarios(fold(groups, members), groups, members, torch.zeros_like(groups))
-        rows = take_rows(y, torch.arange(y.shape[0], device=y.device).repeat(count))
+        rows = take_rows(y, torch.arange(y.shape[0], device=device_of(y)).repeat(count))
         return sum_first(self.rollout(rows, scenarios, count).view(count, -1)) / count

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.tensor_checks import device_of
 
 __all__ = ["AfterSteps", "OnEntering", "OnLeaving", "Truncation"]
 
@@ -39,7 +40,7 @@ class Truncation(ABC):
 
     def start(self, y: TensorDictBase) -> Tensor:
         """What the rule remembers of trajectories that start at ``y`` ``[N]``, with all features: int64 ``[N, w]``."""
-        return torch.zeros(*y.batch_size, self.width, dtype=torch.int64, device=y.device)
+        return torch.zeros(*y.batch_size, self.width, dtype=torch.int64, device=device_of(y))
 
     @abstractmethod
     def stop(self, y: TensorDictBase, age: Tensor, memory: Tensor) -> Tensor:

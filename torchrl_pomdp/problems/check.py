@@ -27,6 +27,7 @@ from torchrl_pomdp.problems.check_laws import (
 )
 from torchrl_pomdp.problems.check_runs import check_engine, check_environment
 from torchrl_pomdp.problems.probe import Probe, distributions, refuse, require, same, tolerance
+from torchrl_pomdp.tensor_checks import device_of
 
 __all__ = ["check_belief_model"]
 
@@ -146,7 +147,9 @@ def _visited(probe: Probe, starts: TensorDictBase, seed: int) -> tuple[TensorDic
     every = torch.cat([each.clone() for each in seen])
     _check_fingerprint(probe, every)
     _, number = model.fingerprint(every).unique(return_inverse=True)
-    first = torch.full_like(number, len(number)).scatter_reduce(0, number, torch.arange(len(number), device=y.device), "amin")
+    first = torch.full_like(number, len(number)).scatter_reduce(
+        0, number, torch.arange(len(number), device=device_of(y)), "amin"
+    )
     every = every[first[first < len(number)].sort().values]
     ended = probe.terminal(every)
     return _spread(every[~ended], _STATES), _spread(every[ended], _STATES)
@@ -164,7 +167,7 @@ def _call_parts(probe: Probe, y: TensorDictBase, u: Tensor) -> None:
 def _spread(y: TensorDictBase, count: int) -> TensorDictBase:
     """At most ``count`` states of a flat batch, the first and the last among them."""
     size = y.batch_size[0]
-    return y if size <= count else y[torch.linspace(0, size - 1, count, device=y.device).long()]
+    return y if size <= count else y[torch.linspace(0, size - 1, count, device=device_of(y)).long()]
 
 
 def _check_fingerprint(probe: Probe, every: TensorDictBase) -> None:

@@ -13,6 +13,7 @@ from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.tabular import TabularModel
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 from torchrl_pomdp.problems.probe import Probe, refuse, require, tolerance
+from torchrl_pomdp.tensor_checks import device_of
 
 __all__ = ["Outcomes", "Pairs", "check_advance", "check_bayes", "check_terminal", "entries_of", "legal_pairs", "noise_of"]
 
@@ -61,7 +62,7 @@ def legal_pairs(probe: Probe, y: TensorDictBase, seed: int) -> Pairs:
     model, mask = probe.model, probe.mask(y)
     state, u = mask.nonzero(as_tuple=True)
     if len(state) > _PAIRS:
-        order = uniform(fold(seed_keys(seed, torch.arange(len(state), device=y.device)), -1), 0).argsort()
+        order = uniform(fold(seed_keys(seed, torch.arange(len(state), device=device_of(y))), -1), 0).argsort()
         state, u = state[order[:_PAIRS]], u[order[:_PAIRS]]
     pairs = Pairs(y[state], u)
     model.check_controls(pairs.y, pairs.u)
@@ -164,8 +165,8 @@ def check_terminal(probe: Probe, y: TensorDictBase, largest: float, seed: int) -
         what,
     )
     samples = 64
-    row = torch.arange(len(pairs.u), device=y.device).repeat_interleave(samples)
-    noise = noise_of(model, fold(seed_keys(seed, torch.arange(len(row), device=y.device)), -3), model.noise_dim)
+    row = torch.arange(len(pairs.u), device=device_of(y)).repeat_interleave(samples)
+    noise = noise_of(model, fold(seed_keys(seed, torch.arange(len(row), device=device_of(y))), -3), model.noise_dim)
     _, nxt = probe.advance(pairs.y[row], pairs.u[row], noise)
     leaves = (~probe.terminal(nxt)).view(-1, samples)
     # A state that is terminal up to a small probability may be left with that probability.
@@ -240,7 +241,7 @@ def _check_linear(probe: Probe, pairs: Pairs) -> None:
     legal = model.action_mask(y).gather(-1, pairs.u[first].unsqueeze(-1)).squeeze(-1)
     first, second, mixed = first[legal], second[legal], Pairs(y[legal], pairs.u[first[legal]])
     most = max(1, MOST_ROWS // model.num_observations)
-    first, second, mixed = first[:most], second[:most], mixed.rows(torch.arange(min(most, len(first)), device=y.device))
+    first, second, mixed = first[:most], second[:most], mixed.rows(torch.arange(min(most, len(first)), device=device_of(y)))
     if len(first):
         _check_mixed(probe, pairs.rows(first), pairs.rows(second), mixed, key)
 

@@ -23,7 +23,7 @@ from torchrl_pomdp.problems.rocksample_model import (
     RockSample,
     offsets,
 )
-from torchrl_pomdp.tensor_checks import check_device, check_entries, check_keys
+from torchrl_pomdp.tensor_checks import check_device, check_entries, check_keys, device_of
 
 __all__ = ["NearestRock", "RockEncoder", "RockSample", "random_rocks", "rocksample"]
 
@@ -216,5 +216,5 @@ class RockEncoder(Encoder):
         good = y.get("belief").T * (location < self.exit)
         known, places = torch.cat([good, 4.0 * good * (1.0 - good)]), self.places.index_select(1, location)
         near = known * places[: self.num_rocks].repeat(2, 1)
-        control = self.base_policy(y).get("action") == torch.arange(self.num_controls, device=y.device).unsqueeze(-1)
+        control = self.base_policy(y).get("action") == torch.arange(self.num_controls, device=device_of(y)).unsqueeze(-1)
         return torch.cat([known, near, places, control.to(self.dtype)]).T.contiguous()

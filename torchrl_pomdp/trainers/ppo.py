@@ -31,6 +31,7 @@ from torchrl_pomdp.modules.threads import kept_threads
 from torchrl_pomdp.noise import fold
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.progress import progress_bar
+from torchrl_pomdp.tensor_checks import device_of
 from torchrl_pomdp.trainers.architecture import make_networks, make_values
 from torchrl_pomdp.trainers.checkpoint import problem_digest
 
@@ -215,7 +216,7 @@ class Training:
         self.loss.entropy_coeff.fill_(remaining * _ENTROPY)
         rows = self.labelled(batch)
         for _ in range(_EPOCHS):
-            for chosen in torch.randperm(len(rows), device=rows.device).chunk(_MINIBATCHES):
+            for chosen in torch.randperm(len(rows), device=device_of(rows)).chunk(_MINIBATCHES):
                 losses = self.loss(rows[chosen])
                 self.optimizer.zero_grad()
                 (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
