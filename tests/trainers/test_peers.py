@@ -15,6 +15,7 @@ from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import Checkpoint, PolicyIterationConfig, compare_peers, make_networks, make_values, peers
 from torchrl_pomdp.trainers.checkpoint import problem_digest, save_checkpoint
+from torchrl_pomdp.trainers.ppo import Training
 
 SEARCHES = [f"{name} {mode}" for name in ("POMCP", "DESPOT") for mode in ("orig", "mod", "fair")]
 LEARNT = ["R-T of urgency", "pAPI-NT 1", "pAPI-NT 1 + R-NT"]
@@ -85,19 +86,19 @@ def test_only_the_original_mode_may_do_everything(line3):
 
 
 def test_ppo_is_trained_once(line3, tmp_path, monkeypatch):
-    trained = []
+    monkeypatch.setattr(peers, "_peers", lambda problem, *_: {"greedy": peers._Peer(GreedyRepair(problem.model))})
+    updates, own = [], Training.update
 
-    def fake(problem, *, steps, seed, progress):
-        trained.append((steps, seed))
-        return make_networks(problem.unpartitioned(), PolicyIterationConfig(), 5).policies[0].eval()
+    def update(training, batch):
+        updates.append(training.seed)
+        own(training, batch)
 
-    monkeypatch.setattr(peers, "ppo", fake)
-    y = line3.model.unrestricted().with_features(line3.start(torch.arange(20)))
-    logits = [peers._trained_ppo(line3, tmp_path, 5000, 3, False)(y.clone())["logits"] for _ in range(2)]
-    assert trained == [(5000, 3)]
-    assert torch.equal(*logits)
-    peers._trained_ppo(line3, tmp_path, 5001, 3, False)
-    assert trained == [(5000, 3), (5001, 3)]
+    monkeypatch.setattr(Training, "update", update)
+    options = {"ppo_steps": 4096, "seconds": 0.001, "seed": 3}
+    first = compare_peers(line3, tmp_path, states=2, **options)["PPO"].costs
+    more = compare_peers(line3, tmp_path, states=12, **options)["PPO"].costs
+    assert updates == [3]
+    assert more[:2] == first
 
 
 def test_what_does_not_belong_is_refused(folder, line3, checkpoint, linear20, tmp_path):
@@ -184,6 +185,6 @@ def test_costs_of_two_comparisons_are_paired(folder):
 def test_ppo_comes_last(line3, tmp_path, monkeypatch):
     order = []
     monkeypatch.setattr(peers, "_peers", lambda problem, *_: {"greedy": peers._Peer(GreedyRepair(problem.model))})
-    monkeypatch.setattr(peers, "_trained_ppo", lambda problem, *_: order.append("trained") or GreedyRepair(problem.model))
+    monkeypatch.setattr(peers, "ppo", lambda problem, **_: order.append("trained") or GreedyRepair(problem.model))
     compare_peers(line3, tmp_path, ppo_steps=5000, states=2, seconds=0.001, report=lambda name, _: order.append(name))
     assert order == ["greedy", "trained", "PPO"]

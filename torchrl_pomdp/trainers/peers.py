@@ -37,7 +37,7 @@ from torchrl_pomdp.checks import (
     check_path,
     check_sequence,
 )
-from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
+from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
@@ -47,7 +47,6 @@ from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.planners import DESPOT, POMCP
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.report.peers import Outcome
-from torchrl_pomdp.trainers.architecture import make_networks
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest
 from torchrl_pomdp.trainers.ppo import BATCH, ppo
 from torchrl_pomdp.trainers.recipes import r_t
@@ -144,7 +143,7 @@ def compare_peers(
     execution = _Execution(problem, path, states, seed, progress)
     outcomes: dict[str, Outcome] = {}
     for name in dict.fromkeys(names):
-        peer = peers[name] or _Peer(_trained_ppo(problem, path, ppo_steps or 0, seed, progress))
+        peer = peers[name] or _Peer(ppo(problem, steps=ppo_steps or 0, seed=seed, path=path / "ppo.pt", progress=progress))
         outcomes[name] = execution.outcome(name, peer)
         report(name, outcomes[name])
     return outcomes
@@ -186,19 +185,6 @@ def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> d
 def _scenarios(seconds: float) -> int:
     """Scenarios that DESPOT has time for: the root alone takes a simulation of each for every control."""
     return min(_SCENARIOS, max(10, round(10_000 * seconds)))
-
-
-def _trained_ppo(problem: Problem, folder: Path, steps: int, seed: int, progress: bool) -> Policy:
-    """PPO's policy, from the folder where it has been trained."""
-    path, owner = folder / "ppo.pt", digest([problem_digest(problem), steps, seed])
-    content = kept(path, owner)
-    if content is None:
-        trained = ppo(problem, steps=steps, seed=seed, progress=progress)
-        keep(path, owner, {"policy": trained.state_dict()})
-        return trained
-    policy = make_networks(problem.unpartitioned(), PolicyIterationConfig(), seed).policies[0].eval()
-    policy.load_state_dict(content["policy"])
-    return policy
 
 
 class _Counted:
