@@ -78,7 +78,8 @@ def write_report(folder: str | PathLike[str], *, problem: Problem | None = None)
     if problem is not None:
         check_instance("problem", problem, Problem)
     run = read_run_folder(folder, problem)
-    sections = [_problem(run), _costs(run), _table(run), _parts(run)]
+    reasons, rejected = _reasons(run)
+    sections = [_problem(run, rejected), _costs(run, reasons, rejected), _table(run, rejected), _parts(run)]
     data = ""
     if run.policy is None:
         sections += [_section(title, _paragraph(run.missing)) for title in _TITLES[3:]]
@@ -99,7 +100,7 @@ def write_report(folder: str | PathLike[str], *, problem: Problem | None = None)
 # ---- what the records say ----------------------------------------------------------------------------------------------
 
 
-def _problem(run: RunFolder) -> str:
+def _problem(run: RunFolder, rejected: Mapping[str, str]) -> str:
     config = run.config
     trained = [result for result in run.results if is_iteration(result.name)]
     finished = f"{len(run.iterations)} of {config['config'].get('iterations', '?')}"
@@ -111,7 +112,7 @@ def _problem(run: RunFolder) -> str:
             ratio, interval = ratio_texts(best.comparison.ratio)
             against = f", {ratio} of {run.results[0].name} ({interval})" if best.comparison.ratio else ""
             lines.append(f"{best.name} costs {interval_text(best.comparison.cost)}{against}.")
-        if run.policy.name in _reasons(run)[1]:
+        if run.policy.name in rejected:
             last = run.policy.name
             lines.append(f"No iteration was accepted, so the base policy is the best one; what is played below is {last}.")
     numbers = {**config["config"], "states": config.get("states"), "version": config.get("version")}
@@ -121,11 +122,10 @@ def _problem(run: RunFolder) -> str:
     return f"<h1>{escape(str(config['problem']))}</h1>{''.join(map(_paragraph, lines))}{details}{words}{_contents()}"
 
 
-def _costs(run: RunFolder) -> str:
+def _costs(run: RunFolder, reasons: Mapping[str, str], rejected: Mapping[str, str]) -> str:
     costs = [(r.name, r.comparison.cost) for r in run.results if r.name == run.config["base"] or is_iteration(r.name)]
     if not any(is_iteration(name) for name, _ in costs):
         return _section("Cost per iteration", _paragraph("No iteration is finished yet."))
-    reasons, rejected = _reasons(run)
     text = "Means over the start states of the evaluation, with 95 % intervals. A hollow circle was not accepted."
     told = [f"<li>{escape(name)}: {escape(reason)}</li>" for name, reason in reasons.items()]
     return _section("Cost per iteration", f"{_paragraph(text)}{iteration_chart(costs, rejected)}<ul>{''.join(told)}</ul>")
@@ -138,10 +138,10 @@ def _reasons(run: RunFolder) -> tuple[dict[str, str], dict[str, str]]:
     return reasons, {name: reasons[name] for name, iteration in named.items() if not iteration.get("accepted")}
 
 
-def _table(run: RunFolder) -> str:
+def _table(run: RunFolder, rejected: Mapping[str, str]) -> str:
     if not run.results:
         return _section("Policies", _paragraph("No policy is evaluated yet."))
-    best = None if run.policy is None or run.policy.name in _reasons(run)[1] else run.policy.name
+    best = None if run.policy is None or run.policy.name in rejected else run.policy.name
     rows = [
         (
             result.name,
