@@ -288,6 +288,25 @@ def test_what_cannot_be_seen_or_done_is_no_belief(u, z, error, message):
         estimate(torch.tensor(u), torch.tensor(z))
 
 
+@pytest.mark.parametrize("name", ["line3", "two_robots20", "tiger", "maintenance1", "rocksample7x8"])
+@pytest.mark.parametrize(
+    ("u", "error", "message"),
+    [
+        (0, TypeError, "action must be a Tensor, got 0"),
+        ([0, 0], TypeError, "action must be a Tensor"),
+        (None, TypeError, "action must be a Tensor"),
+        (torch.tensor([0.0, 0.0]), ValueError, r"action must be int64 of shape \(2,\), got torch.float32"),
+        (torch.tensor([0]), ValueError, r"action must be int64 of shape \(2,\), got torch.int64 of shape \(1,\)"),
+    ],
+)
+def test_nothing_is_seen_after_what_is_no_control(name, u, error, message):
+    problem = make_problem(name)
+    model, y = problem.model, problem.start(torch.arange(2))
+    assert model.observation_probs(y, torch.tensor([0, 0])).shape == (2, model.num_observations)
+    with pytest.raises(error, match=message):
+        model.observation_probs(y, u)
+
+
 def test_what_robots_see_together_and_after_a_repair():
     with pytest.raises(ValueError, match="observation 4 at batch index"):
         estimate(torch.tensor([0, 0]), torch.tensor([0, 4]), level=1)

@@ -97,6 +97,15 @@ class JointControls(nn.Module):
                 f"{self.num_agent_controls}^{self.num_agents} = {self.num_controls}: use {instead}"
             )
 
+    def check_control_shape(self, y: TensorDictBase, u: Tensor) -> None:
+        """Raise unless ``u`` is an int64 tensor ``[*B, *S]`` for feature states ``y`` ``[*B]``; its numbers are not looked at.
+
+        Raises:
+            TypeError: if ``u`` is no tensor.
+            ValueError: if its type or shape is another.
+        """
+        check_index("action", u, torch.Size([*y.batch_size, *self.control_shape]))
+
     def check_controls(self, y: TensorDictBase, u: Tensor) -> None:
         """Raise unless ``u`` are legal controls in ``y``; its ``"action_mask"`` is believed if it has one.
 
@@ -108,7 +117,7 @@ class JointControls(nn.Module):
             TypeError: if ``u`` is no tensor.
             ValueError: if its type or shape is another, or a control is illegal; the message lists the legal ones.
         """
-        check_index("action", u, torch.Size([*y.batch_size, *self.control_shape]))
+        self.check_control_shape(y, u)
         mask = y.get("action_mask", None)
         mask = self.action_mask(y) if mask is None else mask
         low, high = u.aminmax() if u.numel() else (0, 0)

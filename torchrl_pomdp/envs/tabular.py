@@ -222,7 +222,8 @@ class TabularModel(BeliefModel):
         return sum_first((self.cost[u] * y.get("belief")).movedim(-1, 0))
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
-        r""":math:`\hat p(z\mid b,u)`, ``[*B, Z]``."""
+        r""":math:`\hat p(z\mid b,u)`, ``[*B, Z]``; raises as :meth:`check_control_shape` does."""
+        self.check_control_shape(y, u)
         return self._sees.mix(self._predicted(y, u), u.reshape(-1)).view(*y.batch_size, self.num_observations)
 
     def estimator(self, y: TensorDictBase, u: Tensor, z: Tensor) -> TensorDictBase:

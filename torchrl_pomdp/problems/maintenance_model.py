@@ -206,7 +206,11 @@ class MaintenanceModel(BeliefModel):
         return cost.masked_fill(self.is_terminal(y), 0.0)
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
-        r""":math:`\hat p(z\mid b_y,u)`, ``[*B, K^n]``: the product of the components'."""
+        r""":math:`\hat p(z\mid b_y,u)`, ``[*B, K^n]``: the product of the components'.
+
+        Raises as :meth:`check_control_shape` does.
+        """
+        self.check_control_shape(y, u)
         controls = self._controls(u)
         seen = self._seen(self._worn(self._planes(y), controls), controls)
         joint = seen[0]

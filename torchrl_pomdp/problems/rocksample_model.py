@@ -166,7 +166,11 @@ class RockSample(BeliefModel):
         return self._cost(u, pair, good)
 
     def observation_probs(self, y: TensorDictBase, u: Tensor) -> Tensor:
-        """Probabilities of none, good and bad, ``[*B, 3]``: none unless a rock is checked."""
+        """Probabilities of none, good and bad, ``[*B, 3]``: none unless a rock is checked.
+
+        Raises as :meth:`check_control_shape` does.
+        """
+        self.check_control_shape(y, u)
         pair, _, good = self._concerned(y, u)
         (_, seen_good), (_, seen_bad) = _joint(good, self.accuracy[pair])
         blind = u < FIRST_CHECK

@@ -261,8 +261,11 @@ class RepairModel(Robots):
         """Joint distribution of the robots' observed levels, ``[*B, K^R]``.
 
         Raises:
-            ValueError: if there are more than 4096 joint observations of several robots, too many for tables.
+            TypeError: by :meth:`check_control_shape`.
+            ValueError: by :meth:`check_control_shape`, or if there are more than 4096 joint observations of several robots,
+                too many for tables.
         """
+        self.check_control_shape(y, u)
         if self.num_robots > 1 and self.num_observations > MAX_ENUMERATED:
             raise ValueError(
                 f"num_observations must be at most {MAX_ENUMERATED} for their probabilities, got {self.num_levels}^"
