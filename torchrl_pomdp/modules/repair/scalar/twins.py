@@ -178,6 +178,12 @@ def networks(data, view, controls):
     _best_control(view, work, 2 * size, weights[last].shape[2], controls)
 
 
+@inner
+def _known_as(robot, lost):
+    """The number that a robot had before the robot ``lost`` was lost; -1: none is."""
+    return robot + 1 if 0 <= lost <= robot else robot
+
+
 @scalar_twin
 def elsewhere(data, view, controls):
     """A policy that knows another graph, and maybe a robot more; for a control that is illegal here, the first that is legal.
@@ -190,14 +196,14 @@ def elsewhere(data, view, controls):
     own = view.work[numbers:].view(np.int64)
     location, chosen = own[:robots], own[robots : 2 * robots]
     for robot in range(len(controls)):
-        location[robot + (1 if 0 <= lost <= robot else 0)] = view.location[robot]
+        location[_known_as(robot, lost)] = view.location[robot]
     if lost >= 0:
         location[lost] = place
     work = view.work[:numbers]
     seen = View(view.stage, location, view.level, view.since, view.intact, view.start, tables, work, view.key)
     choose(policy, seen, chosen)
     for robot in range(len(controls)):
-        controls[robot] = chosen[robot + (1 if 0 <= lost <= robot else 0)]
+        controls[robot] = chosen[_known_as(robot, lost)]
         # What is no control at all stays one that is refused.
         if controls[robot] >= 0 and not legal(view, robot, controls[robot]):
             controls[robot] = 0
