@@ -11,7 +11,7 @@ from torchrl import logger
 from torchrl_pomdp.files import DamagedFileError, load_tensors, save_tensors
 from torchrl_pomdp.identity import digest
 
-__all__ = ["keep", "kept"]
+__all__ = ["keep", "kept", "own_result"]
 
 
 def keep(path: Path, owner: str, content: dict[str, Any]) -> None:
@@ -40,14 +40,27 @@ def kept(path: Path, owner: str, device: torch.device | str = "cpu") -> dict[str
         owner: digest of all that decides the result.
         device: where tensors are put.
     """
+    try:
+        return own_result(path, owner, device)
+    except DamagedFileError as error:
+        logger.warning(f"{error}: made again")
+        return None
+
+
+def own_result(path: Path, owner: str, device: torch.device | str = "cpu") -> dict[str, Any] | None:
+    """Read a result back; None where there is no file.
+
+    Args:
+        path: the file.
+        owner: digest of all that decides the result.
+        device: where tensors are put.
+
+    Raises:
+        DamagedFileError: if the file is damaged or belongs to something else.
+    """
     if not path.is_file():
         return None
-    try:
-        found = load_tensors(path, device)
-        if isinstance(found, dict) and found.get("owner") == owner and found.get("digest") == digest(found.get("content")):
-            return found["content"]
-        reason = f"{path} is damaged or the result of another run"
-    except DamagedFileError as error:
-        reason = str(error)
-    logger.warning(f"{reason}: made again")
-    return None
+    found = load_tensors(path, device)
+    if isinstance(found, dict) and found.get("owner") == owner and found.get("digest") == digest(found.get("content")):
+        return found["content"]
+    raise DamagedFileError(f"{path} is damaged or the result of another run")

@@ -13,7 +13,9 @@ __all__ = ["progress_bar"]
 _SELDOM = 30.0
 
 
-def progress_bar(total: int | None, unit: str, desc: str, show: bool, *, smoothing: float = 0.3, leave: bool = False) -> tqdm:
+def progress_bar(
+    total: int | None, unit: str, desc: str, show: bool, *, smoothing: float = 0.3, leave: bool = False, initial: int = 0
+) -> tqdm:
     """A progress bar on standard error; where that is no terminal, such as a file, a line every half a minute.
 
     Args:
@@ -25,6 +27,7 @@ def progress_bar(total: int | None, unit: str, desc: str, show: bool, *, smoothi
     Keyword Args:
         smoothing: weight of the latest rate in the rate that is shown; 0 for the mean over the whole time.
         leave: whether the bar stays once it is full.
+        initial: units that were done before, which say nothing about the rate.
 
     Examples:
         >>> with progress_bar(2, "state", "label", show=False) as bar:
@@ -35,7 +38,8 @@ def progress_bar(total: int | None, unit: str, desc: str, show: bool, *, smoothi
         # Without a bar, and nothing at its end.
         options = {"leave": False, "ncols": 0, "file": _Lines(sys.stderr)}
         options |= {"mininterval": _SELDOM, "maxinterval": _SELDOM, "delay": _SELDOM}
-    return tqdm(total=total, unit=unit, desc=desc, disable=not show, unit_scale=total is None, smoothing=smoothing, **options)
+    options |= {"initial": initial, "unit_scale": total is None, "smoothing": smoothing}
+    return tqdm(total=total, unit=unit, desc=desc, disable=not show, **options)
 
 
 class _Lines:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import sys
+import threading
 from dataclasses import replace
 
 import pytest
@@ -123,10 +124,36 @@ def test_an_interrupted_training_goes_on_where_it_was(line3, monkeypatch, tmp_pa
     assert made == []
 
 
-def test_a_file_of_another_training_is_not_used(line3, trained, tmp_path):
+def test_a_file_of_something_else_is_refused_and_left_alone(line3, tmp_path):
     path = tmp_path / "ppo.pt"
-    ppo(line3, steps=BATCH, seed=1, path=path)
-    assert torch.equal(weights(ppo(line3, steps=BATCH, path=path)), weights(trained))
+    ppo(line3, steps=16, episodes=1, path=path)
+    for content, options in ((path.read_bytes(), {"seed": 1}), (path.read_bytes()[:-9], {}), (b"my thesis", {})):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=f"path must be a new file or that of this training: .*{path.name}"):
+            ppo(line3, steps=16, episodes=1, path=path, **options)
+        assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("name", ["folder", ".", "..", "file/ppo.pt"])
+def test_a_path_that_cannot_be_written_is_refused_at_once(line3, tmp_path, monkeypatch, name):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(Training, "__init__", None)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="path must be a"):
+        ppo(line3, steps=16, episodes=1, path=name)
+
+
+def test_a_problem_without_a_digest_can_be_trained(line3):
+    lock = threading.Lock()
+
+    def start(keys):
+        with lock:
+            return line3.start(keys)
+
+    with torch.no_grad():
+        policy = ppo(replace(line3, start=start), steps=16, episodes=1)
+    assert torch.isfinite(weights(policy)).all()
 
 
 def test_what_follows_a_cut_is_the_value_of_the_state_there(treadmill):
@@ -204,13 +231,15 @@ def test_refusals(line3, wrong, error, message):
         ppo(arguments.pop("problem"), **arguments)
 
 
-def test_a_progress_bar_counts_the_steps(line3, monkeypatch):
+def test_a_progress_bar_counts_the_steps(line3, monkeypatch, tmp_path):
     bars = []
 
-    def bar(total, unit, desc, show):
-        bars.append(tqdm(total=total, unit=unit, desc=desc, file=io.StringIO()))
+    def bar(total, unit, desc, show, initial):
+        bars.append(tqdm(total=total, unit=unit, desc=desc, initial=initial, file=io.StringIO()))
         return bars[0]
 
     monkeypatch.setattr(sys.modules[Training.__module__], "progress_bar", bar)
-    ppo(line3, steps=2 * BATCH, progress=True)
-    assert (bars[0].n, bars[0].total, bars[0].unit) == (2 * BATCH, 2 * BATCH, "step")
+    for done in (0, 2 * BATCH):
+        ppo(line3, steps=2 * BATCH, path=tmp_path / "ppo.pt", progress=True)
+        assert (bars[-1].n, bars[-1].total, bars[-1].unit) == (2 * BATCH, 2 * BATCH, "step")
+        assert bars[-1].initial == done

@@ -35,6 +35,7 @@ from torchrl_pomdp.checks import (
     check_integer,
     check_number,
     check_path,
+    check_seed,
     check_sequence,
 )
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES
@@ -132,6 +133,7 @@ def compare_peers(
             raise ValueError(f"checkpoint must be of the problem {problem.name}, got one of {checkpoint.problem.name}")
     if ppo_steps is not None:
         check_integer("ppo_steps", ppo_steps, BATCH, _MOST_STEPS)
+        check_seed("seed", seed)
     # Whatever cannot be made is refused before anything is written.
     peers: dict[str, _Peer | None] = {**_peers(problem, checkpoint, seconds)}
     if ppo_steps is not None:
@@ -143,7 +145,9 @@ def compare_peers(
     execution = _Execution(problem, path, states, seed, progress)
     outcomes: dict[str, Outcome] = {}
     for name in dict.fromkeys(names):
-        peer = peers[name] or _Peer(ppo(problem, steps=ppo_steps or 0, seed=seed, path=path / "ppo.pt", progress=progress))
+        peer = peers[name] or _Peer(
+            ppo(problem, steps=ppo_steps or 0, seed=seed, path=path / f"ppo-{ppo_steps}.pt", progress=progress)
+        )
         outcomes[name] = execution.outcome(name, peer)
         report(name, outcomes[name])
     return outcomes

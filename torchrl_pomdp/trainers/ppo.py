@@ -23,8 +23,9 @@ from torchrl.objectives.value import GAE
 from torchrl_pomdp.checks import check_flag, check_instance, check_integer, check_path, check_seed
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.belief_env import BeliefEnv
+from torchrl_pomdp.files import DamagedFileError, check_folder
 from torchrl_pomdp.identity import digest
-from torchrl_pomdp.kept import keep, kept
+from torchrl_pomdp.kept import keep, own_result
 from torchrl_pomdp.modules import PolicyNetwork, ValueNetwork
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.threads import kept_threads
@@ -64,14 +65,14 @@ def ppo(
 
     Rewards are minus expected stage costs; controls are drawn from a softmax over the legal ones. An episode ends in a terminal
     state, or is cut after ``model.horizon`` stages, and then the value of the state where it is cut stands for what follows.
-    The first episodes begin as if they had run for different times already; otherwise all would be in the same stage at the
-    same time, and each update would forget the others. Costs span many orders of magnitude, so rewards are not scaled by one
-    number: advantages and the targets of values are taken in multiples of their state's pessimistic cost, as by
-    :class:`~torchrl_pomdp.objectives.ValueLoss`.
+    After every 64 updates all episodes begin anew, as if they had run for different times already; otherwise all would be in
+    the same stage at the same time, and each update would forget the others. Costs span many orders of magnitude, so rewards
+    are not scaled by one number: advantages and the targets of values are taken in multiples of their state's pessimistic cost,
+    as by :class:`~torchrl_pomdp.objectives.ValueLoss`.
 
     After every 16 stages of all episodes an update makes 4 passes over their steps in 8 minibatches, by Adam with a step size
     that falls from 0.0005 to 0, gradients of norm 0.5 at most, ratios clipped at 0.2, advantages with :math:`\lambda=0.95`, and
-    an entropy bonus that falls from 0.02 to 0. After 64 updates all episodes begin anew. The networks are those of the default
+    an entropy bonus that falls from 0.02 to 0. The networks are those of the default
     :class:`~torchrl_pomdp.trainers.PolicyIterationConfig` with the problem's encoder, one of each for all parts. The arguments
     decide the result, however often the training was interrupted; PyTorch's global generators are left as they were. With seed
     0, 65 536 steps come within 0.2 % of the optimum on ``line3``; on ``linear20`` a million steps cost 0.946 and two million
@@ -85,7 +86,8 @@ def ppo(
         steps: belief steps of all episodes together; a last batch that is not full is left out.
         seed: seed of weights, start states, observations, controls and minibatches.
         episodes: episodes side by side. More make larger updates and fewer of them, which an accelerator wants.
-        path: file where the training is kept after every 64 updates, and from which it goes on; None: it is not kept.
+        path: file where the training is kept after every 64 updates and at its end, and from which it goes on; other arguments,
+            and more steps too, make another training, which wants another file. None: it is not kept.
         progress: whether to show a progress bar with the rate.
 
     Returns:
@@ -93,8 +95,9 @@ def ppo(
         ``"action"``, int64 ``[*B]``.
 
     Raises:
-        TypeError: if an argument is of the wrong kind.
-        ValueError: if there are fewer than 16 steps of each episode, or a number is out of range.
+        TypeError: if an argument is of the wrong kind, or a training is to be kept of a problem that has no digest.
+        ValueError: if there are fewer than 16 steps of each episode, a number is out of range, or ``path`` cannot be written or
+            holds something else; before anything is computed.
 
     Examples:
         >>> from torchrl_pomdp.evaluation import discounted_costs
@@ -109,27 +112,36 @@ def ppo(
     episodes = check_integer("episodes", episodes, 1, _MOST_EPISODES)
     size = episodes * _STAGES
     steps, seed = check_integer("steps", steps, size, _MOST), check_seed("seed", seed)
-    path = None if path is None else check_path("path", path)
+    check_flag("progress", progress)
     batches = steps // size
-    owner = digest([problem_digest(problem), batches, seed, episodes])
+    file = None if path is None else _File(path, digest([problem_digest(problem), batches, seed, episodes]))
     training = Training(problem, batches, seed, episodes)
-    content = None if path is None else kept(path, owner)
-    if content is not None:
-        training.load_state_dict(content)
-    bar = progress_bar(batches * size, "step", "PPO", check_flag("progress", progress))
+    if file is not None and file.content is not None:
+        training.load_state_dict(file.content)
+    bar = progress_bar(batches * size, "step", "PPO", progress, initial=training.done * size)
     # Sums of gradients would depend on the number of threads.
-    with bar, kept_threads(1):
-        if not bar.disable:
-            # What is done already says nothing about the rate.
-            bar.initial = training.done * size
-            bar.update(training.done * size)
+    with bar, kept_threads(1), torch.enable_grad():
         while training.done < batches:
             for batch in training.segment():
                 training.update(batch)
                 bar.update(size)
-            if path is not None:
-                keep(path, owner, training.state_dict())
+            if file is not None:
+                keep(file.path, file.owner, training.state_dict())
     return training.policy.eval()
+
+
+class _File:
+    """The file of a training, which can be written and holds nothing else, and what is in it."""
+
+    def __init__(self, path: str | PathLike[str], owner: str) -> None:
+        self.path, self.owner = check_path("path", path), owner
+        check_folder("path", self.path.parent)
+        if self.path.exists() and not self.path.is_file():
+            raise ValueError(f"path must be a file, got {self.path}, which is none")
+        try:
+            self.content = own_result(self.path, owner)
+        except DamagedFileError as error:
+            raise ValueError(f"path must be a new file or that of this training: {error}") from error
 
 
 @contextmanager
