@@ -186,11 +186,13 @@ TRAINERS = {
     "trainers.papi_nt": lambda _: an_algorithm(trainers.papi_nt),
     "trainers.papi_t": lambda _: an_algorithm(trainers.papi_t),
     "trainers.api": lambda _: an_algorithm(trainers.api, partitioned=False),
-    "trainers.ppo": lambda _: case(
+    "trainers.ppo": lambda folder: case(
         trainers.ppo,
         problem=a_problem(),
         steps=(4096, integers(4096, 10**12)),
         seed=(0, seeds()),
+        episodes=(256, integers(1, 1 << 20)),
+        path=(folder / "ppo.pt", [*(wrong for wrong in paths() if wrong.value is not None), Hostile("a folder", folder)]),
         progress=(False, flags()),
     ),
     "trainers.r_nt": lambda _: case(trainers.r_nt, problem=a_problem(), base_policy=(greedy(), not_callable())),
