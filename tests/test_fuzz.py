@@ -59,7 +59,8 @@ EXEMPT = {
     "envs.gym.Simulation modules.Truncation",
     "made by the library, not by its users": "*.Comparison *.Estimate *.Iteration *.PartRecord *.Effort *.DamagedFileError "
     "*.PartitionReport *.Change *.Version *.Decision *.Interval *.Solution *.ErrorBounds",
-    "run at every belief step, on what was checked before": "noise.fold noise.uniform noise.fingerprint noise.permuted",
+    "run at every belief step, on what was checked before": "noise.fold noise.uniform noise.fingerprint noise.permuted "
+    "tensor_checks.device_of",
     "of any object": "identity.*",
     "of no argument": "changes.model_changes",
 }
