@@ -99,6 +99,11 @@ def test_ppo_is_trained_once(line3, tmp_path, monkeypatch):
     more = compare_peers(line3, tmp_path, states=12, **options)["PPO"].costs
     assert updates == [3]
     assert more[:2] == first
+    # More steps are another training, which leaves the first one alone.
+    compare_peers(line3, tmp_path, states=2, **(options | {"ppo_steps": 8192}))
+    assert updates == [3, 3, 3]
+    assert compare_peers(line3, tmp_path, states=2, **options)["PPO"].costs == first
+    assert updates == [3, 3, 3]
 
 
 def test_what_does_not_belong_is_refused(folder, line3, checkpoint, linear20, tmp_path):
