@@ -27,20 +27,18 @@ def test_the_model_does_not_see_the_difference(graph, robots, count):
         image = symmetry(y)
         assert torch.equal(image["action_mask"], model.action_mask(image))
         torch.testing.assert_close(model.expected_cost(image), model.expected_cost(y))
-        for u in range(model.num_controls):
-            rows = y["action_mask"][:, u].nonzero().squeeze(-1)
-            control = torch.full((len(rows),), u)
-            probs = model.observation_probs(y[rows], control)
-            renamed = symmetry.joint_controls[control]
-            # The joint observation's digits are the robots' levels.
-            levels = torch.arange(model.num_observations)
-            digits = torch.stack([levels // model.num_levels ** (robots - 1 - r) % model.num_levels for r in range(robots)], -1)
-            z = sum(digits[:, symmetry.robots[r]] * model.num_levels ** (robots - 1 - r) for r in range(robots))
-            of_image = model.observation_probs(image[rows], renamed)
-            torch.testing.assert_close(of_image[:, z], probs)
-            seen = probs.argmax(-1)
-            successor = symmetry(model.estimator(y[rows], control, seen))
-            torch.testing.assert_close(model.estimator(image[rows], renamed, z[seen])["belief"], successor["belief"])
+        rows, control = y["action_mask"].nonzero(as_tuple=True)
+        probs = model.observation_probs(y[rows], control)
+        renamed = symmetry.joint_controls[control]
+        # The joint observation's digits are the robots' levels.
+        levels = torch.arange(model.num_observations)
+        digits = torch.stack([levels // model.num_levels ** (robots - 1 - r) % model.num_levels for r in range(robots)], -1)
+        z = sum(digits[:, symmetry.robots[r]] * model.num_levels ** (robots - 1 - r) for r in range(robots))
+        of_image = model.observation_probs(image[rows], renamed)
+        torch.testing.assert_close(of_image[:, z], probs)
+        seen = probs.argmax(-1)
+        successor = symmetry(model.estimator(y[rows], control, seen))
+        torch.testing.assert_close(model.estimator(image[rows], renamed, z[seen])["belief"], successor["belief"])
 
 
 def test_no_two_are_the_same_and_the_identity_comes_first():
