@@ -1,9 +1,11 @@
 .DELETE_ON_ERROR:
-.PHONY: demo test pytest lint tutorials docs benchmarks
+.PHONY: install demo test pytest lint tutorials docs benchmarks
 
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO ?= runs/demo-$(shell date +%Y%m%d-%H%M%S)
+
+install: .venv/installed
 
 demo: .venv/installed
 	$(BIN)/torchrl-pomdp train linear20 --samples-per-part 6000 --iterations 2 --out $(DEMO)

@@ -248,6 +248,7 @@ TRAINERS = {
         base=("greedy", choices()),
         config=a_config(),
         states=(8, integers(1)),
+        rollout_states=(0, integers(0)),
         online_states=(0, integers(0)),
         online_trajectories=(1, integers(1)),
         staleness=(None, integers(0)),

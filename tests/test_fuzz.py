@@ -60,7 +60,7 @@ EXEMPT = {
     "made by the library, not by its users": "*.Comparison *.Estimate *.Iteration *.PartRecord *.Effort *.DamagedFileError "
     "*.PartitionReport *.Change *.Version *.Decision *.Interval *.Solution *.ErrorBounds",
     "run at every belief step, on what was checked before": "noise.fold noise.uniform noise.fingerprint noise.permuted "
-    "tensor_checks.device_of",
+    "tensor_checks.device_of tensor_checks.place",
     "of any object": "identity.*",
     "of no argument": "changes.model_changes",
 }

@@ -159,13 +159,13 @@ def own_problem(name="machine", parts=None):
 def test_a_problem_of_ones_own_code_is_given(tmp_path):
     problem = own_problem()
     folder = small_run(tmp_path / "run", problem)
-    text = write_report(folder).read_text()
-    assert "build it and give it as problem=" in unescape(text)
-    assert "player-data" not in text
     text = write_report(folder, problem=problem).read_text()
     assert data_of(text)["scene"] == {"kind": "bars", "bars": ["belief 0", "belief 1"], "more": 0}
     with pytest.raises(ValueError, match="problem must be machine"):
         write_report(folder, problem=make_problem("tiger"))
+    with pytest.raises(ValueError, match="build it and give it as problem="):
+        write_report(folder)
+    assert (folder / "report.html").read_text() == text, "a page that lacks its policies would be in its place"
 
 
 def test_texts_from_files_are_escaped(tmp_path):

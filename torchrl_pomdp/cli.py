@@ -30,8 +30,7 @@ class Train:
     """Train policies by approximate policy iteration; the same command goes on with an interrupted run."""
 
     problem: tyro.conf.Positional[str]
-    """The problem: a name such as linear20, see the command problems; a file .toml or .POMDP; or module:function of one's own
-    code."""
+    """The problem: a name such as linear20, see the command problems; a file .toml or .POMDP; or module:function, your code."""
 
     algorithm: Literal["pAPI-NT", "pAPI-T", "API"] = "pAPI-NT"
     """pAPI-NT: partitioned; pAPI-T: partitioned, with simulations truncated at the endgame; API: a single part."""
@@ -46,6 +45,9 @@ class Train:
 
     states: int = 1000
     """Start states of each evaluation."""
+
+    rollout_states: int = 1000
+    """Start states on which online rollout of the base policy is evaluated, slow where it is not compiled; 0 for not at all."""
 
     online_states: int = 0
     """Start states on which online rollout of the trained policy is evaluated, which takes long; 0 for not at all."""
@@ -63,8 +65,7 @@ class Train:
     """Ray workers that label and evaluate at the same time; by default as many as the cluster has CPUs."""
 
     staleness: int | None = None
-    """Asynchronous policy iteration: every part trains at its own pace, at most so many versions ahead of the last one. A seed
-    does not give the same result again."""
+    """Every part trains at its own pace, at most so many versions ahead of the last one; a seed gives no same result again."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,7 @@ class Compare:
     """The problem, as for the command train."""
 
     checkpoint: Path | None = None
-    """A trained policy of the problem; with it come online rollout on top of it, and PPO with as many belief steps as are
-    written in the folder of its run, which may take hours."""
+    """A trained policy of the problem; with it come online rollout on top of it, and PPO with as many steps: hours."""
 
     methods: tuple[str, ...] | None = None
     """Names of the methods to compare with the baseline, as the table has them; all if left out."""
@@ -130,9 +130,13 @@ class Reproduce:
     """Carry out one of the paper's experiments; the same command goes on with an interrupted one."""
 
     experiment: tyro.conf.Positional[Literal["table1", "architectures", "ablation", "optimum", "multirobot", "extensions"]]
-    """table1: the grids and two robots; architectures: API, pAPI-NT and pAPI-T; ablation: rollout and iteration apart; optimum:
-    the line of 3, whose optimal cost is known; multirobot: 4, 8 and 10 robots on a network; extensions: obstacles, repairs that
-    may fail, locations of many kinds."""
+    """Which one:
+    - table1: the grids and two robots;
+    - architectures: API, pAPI-NT and pAPI-T;
+    - ablation: rollout and iteration apart;
+    - optimum: the line of 3, whose optimal cost is known;
+    - multirobot: 4, 8 and 10 robots on a network;
+    - extensions: obstacles, repairs that may fail, locations of many kinds."""
 
     scale: float = 0.05
     """Fraction of the paper's samples; 1 is the paper's."""
@@ -186,8 +190,7 @@ class Report:
     """Problem, as for the command train; a run knows its own unless it is of one's own code."""
 
     animation: Path | None = None
-    """Also write the trajectories of the base policy and the trained one, side by side, to this file .gif, or .mp4 where ffmpeg
-    is installed; of repair problems."""
+    """Also write trajectories of both policies, side by side, to this file .gif, or .mp4 by ffmpeg; of repair problems."""
 
     stages: int = 100
     """The most stages of the animation."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from functools import partial
@@ -49,7 +50,9 @@ def train(command: Train) -> None:
     """Carry out a training run; print its table, then draw its pictures."""
     config = PolicyIterationConfig(**asdict(command.config))
     given = find_problem(command.problem, check_device("device", command.device))
-    numbers: dict[str, Any] = {"states": command.states, "online_states": command.online_states, "staleness": command.staleness}
+    numbers: dict[str, Any] = {
+        name: getattr(command, name) for name in ("states", "rollout_states", "online_states", "staleness")
+    }
     run = TrainingRun(given, command.algorithm, command.base or given.baseline, config, **numbers)
     problem = run.problem
     default = Path("runs") / f"{problem.name}-{command.algorithm}-{run.base}-seed{config.seed}"
@@ -61,7 +64,7 @@ def train(command: Train) -> None:
     print(f"\n{table(results)}\n", flush=True)
     write_json(out / "provenance.json", provenance())
     best = load_checkpoint(out / "best.pt", problem=problem)
-    title = f"{problem.name}, {command.states} start states\nbelow: against {problem.baseline}"
+    title = f"{problem.name}, {command.states} start states"
     figures = {
         out / "costs.png": partial(cost_figure, results, title),
     }
@@ -69,6 +72,10 @@ def train(command: Train) -> None:
         figures[out / "trajectory.png"] = partial(_trajectory_figure, problem, problem.model, best.policy)
     print(draw(figures))
     print(_write_report(out, problem))
+    # A file cannot describe a problem of one's own.
+    named = shlex.quote(str(out / "best.pt"))
+    if problem.spec is None:
+        named += f" --problem {shlex.quote(command.problem)}"
     if best.iteration == 0:
         print(
             f"no iteration was accepted: best.pt is the base policy, {best.name}. What usually helps: more --samples-per-part, "
@@ -77,7 +84,7 @@ def train(command: Train) -> None:
     else:
         print(
             f"best policy: {best.name}, {out / 'best.pt'}. Compare it, or improve it online: torchrl-pomdp evaluate "
-            f"{out / 'best.pt'} --online. On a robot: torchrl_pomdp.controller.Controller.from_checkpoint"
+            f"{named} --online. On a robot: torchrl_pomdp.controller.Controller.from_checkpoint"
         )
 
 
@@ -182,7 +189,7 @@ def compare(command: Compare) -> None:
     results = [Result(method, outcome.comparison) for method, outcome in outcomes.items()]
     title = f"{problem.name}, {command.states} start states"
     pictures = {out / f"{name}-time.png": partial(peer_figure, outcomes, title)}
-    print(draw(pictures | {out / f"{name}.png": partial(cost_figure, results, f"{title}\nbelow: against {problem.baseline}")}))
+    print(draw(pictures | {out / f"{name}.png": partial(cost_figure, results, title)}))
 
 
 def changes(command: Changes) -> None:

@@ -59,15 +59,13 @@ class PolicyIterationConfig:
     """Stages after which a simulated trajectory is cut; None: as many as the discount asks for, 400 for 0.99."""
 
     label_steps: int | None = None
-    """Stages after which the trajectory of a label is cut and the terminal cost added, the problem's pessimistic cost where no
-    value network is; None: as max_steps says. Cuts make labels of many robots affordable."""
+    """Stages after which a label's trajectory is cut, with a terminal cost; None: max_steps. Makes many robots affordable."""
 
     visited_share: float = 0.7
     """Share of the training states taken from the memory of visited states, in [0, 1]; the rest are random."""
 
     visits_per_label: float = 0.7
-    """Trajectories of the base policy, and of each iteration's, for each labelled state of an iteration; the memory retains a
-    tenth of their states. With few of them the same states are labelled again and again."""
+    """Trajectories of each policy for each labelled state; the memory retains a tenth of their states. Few: states repeat."""
 
     exploration: float = 0.15
     """Probability of a random control at each stage of those trajectories, in [0, 1]."""
@@ -79,12 +77,10 @@ class PolicyIterationConfig:
     """Whether mirror images of labelled states are labelled states too."""
 
     encoder: Literal["own", "flat"] = "own"
-    """Network input: the problem's own encoding, for repair beliefs at offsets from the robot; or the flattened beliefs and
-    one-hot location of the paper."""
+    """Network input: the problem's own, for repair beliefs at offsets from the robot; or the paper's flattened beliefs."""
 
     multiagent: bool = False
-    """Whether agents, such as robots, decide one after the other, by one network that they share and with the labels of
-    multiagent rollout; always where there are too many joint controls to be enumerated."""
+    """Whether robots share one network and decide one after the other; always where joint controls are too many to list."""
 
     hidden: tuple[int, ...] = (256, 64)
     """Sizes of the policy networks' hidden layers."""

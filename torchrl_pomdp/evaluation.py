@@ -30,12 +30,16 @@ _Z95 = 1.96
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean with its standard error.
+    """A mean with its standard error; printed, with its 95 % interval.
 
     Attributes:
         mean: sample mean.
         standard_error: of the mean.
         count: sample size.
+
+    Examples:
+        >>> print(Estimate(mean=0.94415, standard_error=0.0112, count=50))
+        0.9442 (0.9222 … 0.9661)
     """
 
     mean: float
@@ -47,6 +51,10 @@ class Estimate:
         """95 % interval (normal approximation)."""
         half = _Z95 * self.standard_error
         return self.mean - half, self.mean + half
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.mean:.4g} ({low:.4g} … {high:.4g})"
 
 
 @dataclass(frozen=True)

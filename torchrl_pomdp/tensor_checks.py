@@ -13,7 +13,16 @@ from torchrl.data import Bounded, Categorical, TensorSpec
 
 from torchrl_pomdp.checks import shown
 
-__all__ = ["check_device", "check_distributions", "check_dtype", "check_entries", "check_keys", "check_tensor", "device_of"]
+__all__ = [
+    "check_device",
+    "check_distributions",
+    "check_dtype",
+    "check_entries",
+    "check_keys",
+    "check_tensor",
+    "device_of",
+    "place",
+]
 
 # How far the sum of probabilities may be from one: rounding in long products of float32 numbers.
 SUM_TOLERANCE = 1e-4
@@ -213,3 +222,13 @@ def device_of(y: TensorDictBase) -> torch.device:
     if y.device is not None:
         return y.device
     return next((leaf.device for leaf in y.values(include_nested=True, leaves_only=True)), torch.device("cpu"))
+
+
+def place(index: tuple[int, ...]) -> str:
+    """Where in a batch something is wrong, for a message; nothing for a single state.
+
+    Examples:
+        >>> place((3, 1)), place(())
+        (' at batch index (3, 1)', '')
+    """
+    return f" at batch index {index}" if index else ""

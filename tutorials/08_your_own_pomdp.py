@@ -223,6 +223,11 @@ plt.show()
 #
 # Here control 0 is to wait, controls 1 and 2 inspect and replace the first pump, 3 and 4 the second, and so on. For every pump
 # the arrays of Part 1 apply: those of the control for the pump that is visited, those of waiting for the others.
+#
+# Three small functions of the library appear below. `sum_first` adds over the first dimension, in an order that does not depend
+# on the batch, so that results are the same to the last bit however they are computed; it overwrites what it is given, hence the
+# clone. (`.sum()` works too, without that promise.) `inverse_cdf(probs, noise)` draws from probabilities with a uniform random
+# number. `fold(keys, week)` makes other random numbers for every week.
 
 
 # %%
@@ -280,7 +285,7 @@ class Pumps(BeliefModel):
         belief, pump, joint = self._afterwards(y, u)
         weight = joint.gather(-1, z[..., None, None].expand(*z.shape, len(LEVELS), 1)).squeeze(-1)  # [*B, 4]
         total = sum_first(weight.movedim(-1, 0).clone())
-        self._refuse_impossible(z, total > 0)
+        self.refuse_impossible(z, total > 0)
         return self.successor(y, belief=belief.scatter(-2, pump, (weight / total.unsqueeze(-1)).unsqueeze(-2)))
 
     def _afterwards(self, y, u):
@@ -435,7 +440,7 @@ problem = Problem(pumps, all_new, name="pumps", base_policies={"worst first": wo
 # %% [markdown]
 # `papi_nt` is the paper's policy iteration. Each iteration labels states with the control that rollout of the last policy
 # finds, teaches a network to imitate them, and compares the network with the best policy so far, on the same start states and
-# the same noise. It is accepted only where it is better with 95 % confidence.
+# the same noise. It is accepted only where it is better with 95 % confidence. (With `progress=True` bars show how far it is.)
 
 # %%
 config = PolicyIterationConfig(
@@ -457,21 +462,28 @@ model = problem.model  # the same as `pumps`, with a partition of a single part,
 costs = {name: discounted_costs(model, policy, all_new, num_states=EVALUATION_STATES) for name, policy in policies.items()}
 results = [Result(name, compare(each, costs["worst first"])) for name, each in costs.items()]
 print(table(results))
-figure = cost_figure(results, f"{PUMPS} pumps; below, the ratio to the rule")
+figure = cost_figure(results, f"{PUMPS} pumps")
 figure.axes[0].set_ylabel("discounted cost, 100 €")
 figure.axes[0].axhline(PUMPS * solution.lower, color="#d55e00")
 figure
 
 # %% [markdown]
 # The orange line is a bound that comes for free: with a technician for each pump the cost would be that of so many single
-# pumps, and one technician can do no better than many.
+# pumps, and one technician can do no better than many. It says how much there is to gain at most. Where networks are not better
+# than a rule, look at this first: compare the rule with a bound, or with its rollout from a hundred start states. If rollout
+# with many trajectories gains nothing, a network that imitates it will not either.
 #
 # The same from the command line: put the code into a file `pumps.py`, with `problem` made by a function
 # `def make(): return Problem(...)`, and then
 #
 #     torchrl-pomdp train pumps:make --samples-per-part 6000 --out runs/pumps
 #
-# which keeps every result as soon as it is there, and goes on where it was when it is interrupted.
+# which keeps every result as soon as it is there, and goes on where it was when it is interrupted. It also evaluates online
+# rollout of the rule. That takes long for a belief model of your own, which tensors simulate: `--rollout-states 50` makes it
+# short. Name the problem again to use what the run has made, as a file cannot describe your code:
+#
+#     torchrl-pomdp report runs/pumps --problem pumps:make
+#     torchrl-pomdp evaluate runs/pumps/best.pt --problem pumps:make
 #
 # # Part 4: deploy it
 #

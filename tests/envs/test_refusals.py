@@ -319,6 +319,8 @@ def test_what_robots_see_together_and_after_a_repair():
     y = TensorDict({"belief": torch.tensor([[0.5, 0.5]])}, [1])
     with pytest.raises(ValueError, match="observation 1 at batch index"):
         never.estimator(y, torch.tensor([0]), torch.tensor([1]))
+    with pytest.raises(ValueError, match="observation 1 is impossible after this control"):
+        never.estimator(y[0], torch.tensor(0), torch.tensor(1))
 
 
 @pytest.mark.parametrize("model", [MODEL, tiger().model])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -163,11 +165,25 @@ def test_a_checkpoint_needs_the_problem_back(trained, tmp_path):
         load_checkpoint(path, problem=own["problem"]())
 
 
+NUMBERS = ["--iterations", "1", "--samples-per-part", "40", "--least-steps", "10", "--hidden", "16", "--max-steps", "8"]
+NUMBERS += ["--states", "8", "--validation-states", "8", "--online-states", "0"]
+
+
+def test_what_the_command_names_to_go_on_with_is_a_command(tmp_path, monkeypatch, capsys):
+    (tmp_path / "own_machine.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("torchrl_pomdp.trainers.policy_iteration.judge", lambda comparison: (True, "accepted"))
+    assert main(["train", "own_machine:problem", "--out", "a run", "--rollout-states", "2", *NUMBERS]) == 0
+    (named,) = re.findall(r"torchrl-pomdp (evaluate .* --online)", capsys.readouterr().out)
+    assert main([*shlex.split(named), "--states", "2", "--trajectories", "1"]) == 0
+    assert "| pAPI-NT 1 + R-NT |" in capsys.readouterr().out
+    del sys.modules["own_machine"]
+
+
 def test_the_command_trains_it_in_a_fresh_process_and_evaluates_it_in_another(tmp_path, monkeypatch, capsys):
     (tmp_path / "own_machine.py").write_text(OWN)
-    numbers = ["--iterations", "1", "--samples-per-part", "40", "--least-steps", "10", "--hidden", "16", "--max-steps", "8"]
-    numbers += ["--states", "8", "--validation-states", "8", "--online-states", "0"]
-    command = [sys.executable, "-m", "torchrl_pomdp.cli", "train", "own_machine:problem", "--out", "run", *numbers]
+    command = [sys.executable, "-m", "torchrl_pomdp.cli", "train", "own_machine:problem", "--out", "run", *NUMBERS]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "threshold: 1.000 of threshold" in done.stdout + done.stderr

@@ -205,6 +205,15 @@ def test_without_an_accepted_iteration_the_base_policy_is_best(tmp_path, line3):
     assert load_checkpoint(tmp_path / "run" / "iteration-1.pt").iteration == 1
 
 
+@pytest.mark.parametrize(("rollout", "online"), [(0, 0), (3, 0), (0, 9)])
+def test_online_rollout_is_evaluated_on_as_many_states_as_are_wanted(tmp_path, rollout, online):
+    found = replace(RUN, rollout_states=rollout, online_states=online).carry_out(tmp_path / "run")
+    counts = {name: comparison.cost.count for name, comparison in found.items() if "R-NT" in name}
+    assert {name.startswith("R-NT of"): count for name, count in counts.items()} == {
+        base: min(count, RUN.states) for base, count in ((True, rollout), (False, online)) if count
+    }
+
+
 @pytest.mark.parametrize("when", ["report", "on_labels"])
 def test_a_folder_deleted_in_the_middle_is_an_error_that_says_so(tmp_path, when):
     """While policies are evaluated, and while networks are trained."""
@@ -236,7 +245,8 @@ def test_a_kill_in_training_leaves_no_row_twice(tmp_path, monkeypatch):
     [
         {"problem": "nosuch"}, {"problem": 3}, {"algorithm": "papi"}, {"base": "lazy"}, {"config": None}, {"config": {}},
         {"states": 0}, {"states": 2.0}, {"states": math.nan}, {"states": True}, {"states": 10**30}, {"states": "9"},
-        {"online_states": -5}, {"online_states": math.inf}, {"online_states": None}, {"online_trajectories": 0},
+        {"rollout_states": -5}, {"rollout_states": 2.5}, {"online_states": -5},
+        {"online_states": math.inf}, {"online_states": None}, {"online_trajectories": 0},
         {"online_trajectories": 10**30}, {"online_trajectories": False},
     ],
 )  # fmt: skip

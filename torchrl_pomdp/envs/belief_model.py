@@ -25,7 +25,7 @@ from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.rows import inverse_cdf
 from torchrl_pomdp.envs.scene import Scene
 from torchrl_pomdp.noise import fingerprint
-from torchrl_pomdp.tensor_checks import check_keys
+from torchrl_pomdp.tensor_checks import check_keys, place
 
 if TYPE_CHECKING:
     from torchrl_pomdp.envs.world import World
@@ -290,11 +290,19 @@ class BeliefModel(JointControls, ABC):
                     f"observation must be in 0..{self.num_observations - 1}, got {int(low if low < 0 else high)} among them"
                 )
 
-    def _refuse_impossible(self, z: Tensor, possible: Tensor) -> None:
-        """Raise if an observation of ``z`` ``[*B]`` is not ``possible`` ``[*B]`` (helper for subclasses)."""
+    def refuse_impossible(self, z: Tensor, possible: Tensor) -> None:
+        """For estimators: raise if an observation is not possible.
+
+        Args:
+            z: observations, int64 ``[*B]``.
+            possible: whether each has a positive probability, bool ``[*B]``.
+
+        Raises:
+            ValueError: at the first one that is not.
+        """
         if not possible.all():
             where = tuple((~possible).nonzero()[0].tolist())
-            raise ValueError(f"observation {int(z[where])} at batch index {where} is impossible after this control")
+            raise ValueError(f"observation {int(z[where])}{place(where)} is impossible after this control")
 
     def drawn(self, generator: StateGenerator, keys: Tensor, name: str = "generator") -> TensorDictBase:
         """The feature states ``[*B]`` that a generator, called ``name`` in messages, gives for int64 keys ``[*B]``, checked.

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.digits import digits, joined
+from torchrl_pomdp.tensor_checks import place
 
 __all__ = ["MAX_ENUMERATED", "JointControls", "check_index"]
 
@@ -127,9 +128,9 @@ class JointControls(nn.Module):
         index = u.clamp(0, self.control_range - 1).unsqueeze(-1)
         where = tuple((~(known & mask.gather(-1, index).squeeze(-1))).nonzero()[0].tolist())
         batch = where[: y.ndim]
-        whose = f"action {int(u[where])} at batch index {batch}"
+        whose = f"action {int(u[where])}{place(batch)}"
         if not self.enumerable:
-            whose = f"action {u[batch].tolist()} at batch index {batch}, of agent {where[-1]},"
+            whose = f"action {u[batch].tolist()}{place(batch)}, of agent {where[-1]},"
         raise ValueError(f"{whose} is illegal; legal there: {mask[where].nonzero().flatten().tolist()}")
 
 

@@ -18,7 +18,7 @@ from torchrl_pomdp.envs.scene import Scene, StatesScene
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.envs.tables import table
 from torchrl_pomdp.envs.world import World
-from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype, check_tensor
+from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype, check_tensor, place
 
 __all__ = ["TabularModel"]
 
@@ -203,7 +203,7 @@ class TabularModel(BeliefModel):
             stuck = (~self.action_mask(y).any(-1)).nonzero()
             if len(stuck):
                 where = tuple(stuck[0].tolist())
-                raise ValueError(f"entry 'belief' of y at batch index {where} has states that share no legal control")
+                raise ValueError(f"entry 'belief' of y{place(where)} has states that share no legal control")
 
     def action_mask(self, y: TensorDictBase) -> Tensor:
         """Controls that are legal in every state of the support, bool ``[*B, U]``."""
@@ -235,7 +235,7 @@ class TabularModel(BeliefModel):
         self.check_controls(y, u)
         self.check_observations(y, z)
         weight, total = self._weigh(self._predicted(y, u), u.reshape(-1), z.reshape(-1))
-        self._refuse_impossible(z, (total > 0).view(y.batch_size))
+        self.refuse_impossible(z, (total > 0).view(y.batch_size))
         return self._successor(y, weight, total)
 
     def advance(self, y: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase]:

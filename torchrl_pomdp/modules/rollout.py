@@ -18,7 +18,7 @@ from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.modules.truncation import Truncation
-from torchrl_pomdp.tensor_checks import check_keys
+from torchrl_pomdp.tensor_checks import check_keys, place
 
 __all__ = ["MAX_STEPS", "MAX_TRAJECTORIES", "Policy", "TerminalCost", "TruncatedRollout", "terminal_costs"]
 
@@ -81,7 +81,7 @@ def check_finite(rule: str, costs: Tensor) -> None:
     """Raise the rule, and where it is broken, unless all costs are finite."""
     if not bool(torch.isfinite(costs).all()):
         where = tuple((~torch.isfinite(costs)).nonzero()[0].tolist())
-        raise ValueError(f"{rule}, got {costs[where].item()} at batch index {where}")
+        raise ValueError(f"{rule}, got {costs[where].item()}{place(where)}")
 
 
 class _Live(NamedTuple):

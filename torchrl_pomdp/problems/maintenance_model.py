@@ -229,7 +229,7 @@ class MaintenanceModel(BeliefModel):
         controls, shown = self._controls(u), self.observations[:, z.reshape(-1)]
         worn = self._worn(self._planes(y), controls)
         chance = self._seen(worn, controls).gather(1, shown.unsqueeze(1)).squeeze(1)
-        self._refuse_impossible(z, (chance > 0).all(0).view(y.batch_size))
+        self.refuse_impossible(z, (chance > 0).all(0).view(y.batch_size))
         return self._successor(y, worn, controls, shown)
 
     def advance(self, y: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase]:

@@ -184,7 +184,7 @@ class RockSample(BeliefModel):
         """
         self.check_controls(y, u)
         self.check_observations(y, z)
-        self._refuse_impossible(z, self.observation_probs(y, u).gather(-1, z.unsqueeze(-1)).squeeze(-1) > 0)
+        self.refuse_impossible(z, self.observation_probs(y, u).gather(-1, z.unsqueeze(-1)).squeeze(-1) > 0)
         pair, rock, good = self._concerned(y, u)
         return self._moved(y, u, pair, rock, good, _posterior(_joint(good, self.accuracy[pair]), z == GOOD))
 

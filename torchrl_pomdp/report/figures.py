@@ -63,6 +63,9 @@ def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
     errors = [half_width(result.comparison.cost) for result in results]
     axes.bar(names, means, yerr=errors, capsize=5, color=["#9aa5b1"] + ["#3572a5"] * (len(results) - 1))
     axes.set_ylabel("discounted cost")
+    # The baseline's own ratio is missing where all are.
+    beside = "difference from" if results[0].comparison.ratio is None else "ratio to"
+    axes.set_xlabel(f"below each name: {beside} {results[0].name}")
     axes.set_title(title)
     axes.spines[["top", "right"]].set_visible(False)
     return figure

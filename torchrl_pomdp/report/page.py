@@ -35,7 +35,7 @@ _WORDS = {
     "API 2": "a network that imitates such rollout, and was improved once more: policy iteration 2",
     "pAPI-NT 2, pAPI-T 2": "the same with a network for each part of the partition; T: simulations are truncated",
     "part": "a region of the feature states, which has networks of its own",
-    "Q-factor": "expected discounted cost of a control, with the base policy from there on",
+    "Q-factor": "expected discounted cost of a control, with the base policy from there on; the player has estimates",
 }
 # What is shown of the losses of a part, and in which form.
 _LOSSES = {"accuracy": ".1%", "regret": ".4g", "relative_error": ".1%"}

@@ -129,7 +129,7 @@
     const box = make("section", { class: "side", "aria-label": name }, sides);
     make("h3", {}, box, name);
     const cost = make("div", { class: "cost" }, box), does = make("div", { class: "does" }, box);
-    const shown = state(box), q = bars(box, "Q-factors of the base policy, above the least");
+    const shown = state(box), q = bars(box, "Q-factors of the base policy, above the least; the best controls");
     return frame => {
       cost.textContent = `cost so far ${frame.cost.toFixed(Math.abs(frame.cost) < 100 ? 2 : 0)}`;
       does.textContent = frame.does;

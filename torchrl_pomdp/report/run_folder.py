@@ -57,7 +57,7 @@ def read_run_folder(folder: Path, problem: Problem | None) -> RunFolder:
 
     Raises:
         DamagedFileError: if a record is damaged.
-        ValueError: if it is no folder of a run, or ``problem`` is not the run's.
+        ValueError: if it is no folder of a run, or ``problem`` is not the run's, or is needed to read its policy.
     """
     if not (folder / "config.json").is_file():
         raise ValueError(f"folder must be that of a training run, {folder} holds no config.json")
@@ -126,8 +126,4 @@ def _policy(folder: Path, problem: Problem | None) -> tuple[Checkpoint | None, s
         best = load_checkpoint(path, problem=problem)
         return (load_checkpoint(last[-1][1], problem=problem) if best.iteration == 0 and last else best), ""
     except DamagedFileError as error:
-        return None, f"No policy can be read: {error}."
-    except ValueError as error:
-        if problem is not None:
-            raise
         return None, f"No policy can be read: {error}."

@@ -381,7 +381,7 @@ def judge(comparison: Comparison) -> tuple[bool, str]:
     """Whether a policy is accepted against the best one so far, and why; costs may be negative."""
     low, high = comparison.difference.interval
     accepted = high < 0.0
-    verdict = "lower" if accepted else "not lower with confidence"
+    verdict = "lower" if accepted else "higher" if low > 0.0 else "not lower with confidence"
     ratio = "" if comparison.ratio is None else f", {comparison.ratio.mean:.4f} times it"
     return accepted, (
         f"cost {verdict}: {comparison.difference.mean:+.4g} ({low:+.4g} … {high:+.4g}) against the best policy so far{ratio}, "

@@ -71,6 +71,10 @@ class TrainingRun:
     states: int = 1000
     """Start states of each evaluation."""
 
+    rollout_states: int = 1000
+    """Start states of the evaluation of online rollout of the base policy: the first of the ``states``, and no more; 0 for
+    none."""
+
     online_states: int = 1000
     """Start states of the evaluation of online rollout on top of the trained policy, which takes longest: the first of the
     ``states``, and no more; 0 for none."""
@@ -91,6 +95,7 @@ class TrainingRun:
         object.__setattr__(self, "base", base)
         check_instance("config", self.config, PolicyIterationConfig)
         check_integer("states", self.states, 1, MAX_STATES)
+        check_integer("rollout_states", self.rollout_states, 0, MAX_STATES)
         check_integer("online_states", self.online_states, 0, MAX_STATES)
         check_integer("online_trajectories", self.online_trajectories, 1, 10**6)
         if self.staleness is not None:
@@ -182,12 +187,11 @@ class _Execution:
             self._compare(name, policy, run.states)
         base = bases[run.base]
         for name, online in self._online(base).items():
-            self._compare(f"{name} of {self.run.base}", online, run.states)
+            self._compare(f"{name} of {run.base}", online, run.rollout_states)
         best, policy = self._train(base)
-        if run.online_states:
-            # The first one: what the networks have been taught.
-            name, online = next(iter(self._online(policy).items()))
-            self._compare(f"{best} + {name}", online, run.online_states)
+        # The first one: what the networks have been taught.
+        name, online = next(iter(self._online(policy).items()))
+        self._compare(f"{best} + {name}", online, run.online_states)
         self.check_folder()
         return self.results
 
@@ -244,7 +248,7 @@ class _Execution:
     def _compare_truncated(self, base: TensorDictModuleBase, value: PartitionedValue) -> None:
         """Evaluate what the networks of the startgame have learnt from, played online, where simulations are cut."""
         truncated = r_t(self.problem, base, value, trajectories=self.run.online_trajectories)
-        self._compare(f"R-T of {self.run.base}", truncated, self.run.states)
+        self._compare(f"R-T of {self.run.base}", truncated, self.run.rollout_states)
 
     def _keep(self, name: str, checkpoint: Checkpoint) -> None:
         self.check_folder()
@@ -260,7 +264,9 @@ class _Execution:
         return self._costs(name, self.problem.base_policies[name], self.run.states)
 
     def _compare(self, name: str, policy: Policy, states: int) -> None:
-        """Add a policy's comparison with the baseline, and bring the folder's metrics up to date."""
+        """Add a policy's comparison with the baseline, and bring the folder's metrics up to date; nothing without states."""
+        if states == 0:
+            return
         costs = self._costs(name, policy, min(states, self.run.states))
         self.results[name] = compare(costs, self._baseline[: costs.numel()])
         self.check_folder()

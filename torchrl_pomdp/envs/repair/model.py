@@ -296,7 +296,7 @@ class RepairModel(Robots):
         location, repaired = self._move(y, u)
         levels = digits(z.reshape(-1), self.num_levels, self.num_robots).T
         planes = self._degrade_planes(self._planes(y))
-        self._refuse_impossible(z, self._possible(planes, location, repaired, levels).view(y.batch_size))
+        self.refuse_impossible(z, self._possible(planes, location, repaired, levels).view(y.batch_size))
         return self._successor(y, self._set_levels(planes, location, levels), location)
 
     def advance(self, y: TensorDictBase, u: Tensor, noise: Tensor) -> tuple[Tensor, TensorDictBase]:
