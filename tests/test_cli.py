@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import ast
+import inspect
 import io
 import json
 import signal
@@ -10,7 +12,7 @@ import time
 import pytest
 import torch
 
-from torchrl_pomdp import commands, files
+from torchrl_pomdp import cli, commands, config, files
 from torchrl_pomdp.cli import main
 from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.envs.repair import trajectory_figure
@@ -257,3 +259,13 @@ def test_trajectory_picture_has_every_stage_and_repair(linear20):
     assert axes.images[0].get_array().shape == (20, stages)
     assert len(axes.collections[0].get_offsets()) == int((trajectory["action"] == 0).sum())
     assert axes.lines[0].get_ydata().tolist() == trajectory["location"][:, 0].tolist()
+
+
+@pytest.mark.parametrize("module", [cli, config])
+def test_the_help_has_no_line_that_is_broken_in_the_middle(module):
+    """An option's text goes on in the help as it does here: a further line is an item of a list, or there is none."""
+    for own in ast.parse(inspect.getsource(module)).body:
+        for entry in own.body if isinstance(own, ast.ClassDef) else []:
+            if isinstance(entry, ast.Expr) and entry is not own.body[0]:
+                _, *lines = ast.literal_eval(entry.value).splitlines()
+                assert all(line.strip().startswith("- ") for line in lines), lines

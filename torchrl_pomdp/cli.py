@@ -65,7 +65,7 @@ class Train:
     """Ray workers that label and evaluate at the same time; by default as many as the cluster has CPUs."""
 
     staleness: int | None = None
-    """Every part trains at its own pace, at most so many versions ahead of the last one; a seed gives no same result again."""
+    """Each part trains at its own pace, at most so many versions ahead; a seed does not give the same result again."""
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ costs = {
 }
 results = [Result(name, compare(cost, costs["greedy"])) for name, cost in costs.items()]
 print(table(results))
-cost_figure(results, f"{PROBLEM}, {EVALUATION_STATES} start states; below each policy its ratio to greedy")
+cost_figure(results, f"{PROBLEM}, {EVALUATION_STATES} start states")
 
 # %% [markdown]
 # On the line of three locations no policy can be below 168.97, so a ratio of 0.867 is the end of the road.

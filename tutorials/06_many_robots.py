@@ -122,7 +122,7 @@ def against(baseline, costs):
 costs = evaluate(problem, policies)
 results = against("greedy", costs)
 print(table(results))
-cost_figure(results, f"{model.num_robots} robots; below, the ratio to greedy")
+cost_figure(results, f"{model.num_robots} robots")
 
 # %% [markdown]
 # *urgency*, which weighs damage against distance, is a better base policy, and free. Robots that guess wrongly are much worse
@@ -154,7 +154,7 @@ signalled = MultiagentRollout(model, greedy, scheme="autonomous", signalling=net
 costs |= evaluate(problem, {"signalled": signalled, "network": network})
 results = against("greedy", {name: costs[name] for name in ("greedy", "autonomous", "signalled", "one at a time", "network")})
 print(table(results))
-cost_figure(results, f"{model.num_robots} robots; below, the ratio to greedy")
+cost_figure(results, f"{model.num_robots} robots")
 
 # %% [markdown]
 # With the network as signalling policy robots that do not wait are nearly as good as robots that do. The network alone, which
@@ -207,7 +207,7 @@ policies = {
 }
 results = against("old policy", evaluate(changed, policies))
 print(table(results))
-cost_figure(results, "after the change; below, the ratio to the old policy")
+cost_figure(results, "after the change")
 
 # %%
 y = changed.model.with_features(changed.start(torch.tensor(4)))

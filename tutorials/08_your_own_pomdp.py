@@ -143,7 +143,7 @@ policies = {
 }
 costs = {name: discounted_costs(pump, policy, new, num_states=ROLLOUT_STATES) for name, policy in policies.items()}
 results = [Result(name, compare(each, costs["rule"])) for name, each in costs.items()]
-figure = cost_figure(results, "one pump; below, the ratio to the rule")
+figure = cost_figure(results, "one pump")
 figure.axes[0].set_ylabel("discounted cost, 100 €")
 figure.axes[0].axhspan(solution.lower, solution.upper, color="#d55e00", alpha=0.6, zorder=3)
 figure

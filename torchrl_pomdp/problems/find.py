@@ -51,9 +51,8 @@ def _own_problem(text: str) -> Problem:
     try:
         make = getattr(importlib.import_module(name), attribute)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
-        raise ValueError(
-            f"problem must name a module, which can be in this folder, and a function in it, got {shown(text)}: {error}"
-        ) from error
+        where = "the present folder is searched too"
+        raise ValueError(f"problem must name a module and a function in it, got {shown(text)}: {error}; {where}") from error
     if not callable(make):
         raise TypeError(f"{text} must be a function, got {shown(make)}")
     try:
