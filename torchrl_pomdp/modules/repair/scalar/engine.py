@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -128,8 +129,9 @@ class RepairEngine(ScalarEngine):
         self.policy, self.model, self.numbers, self.refresh = policy, model, numbers, refresh
         self._loops = Loops()
         self._spare: list[Work] = []
-        # All joint controls, [U, R], once they have been asked for.
-        self._every: NDArray[np.int64] | None = None
+        # What a model computes anew whenever it is asked takes a tenth of the time of a decision.
+        self._belief, self._location = (model.num_locations, model.num_levels), (model.num_robots,)
+        self._dtype, self._largest = model.dtype, float(torch.finfo(model.dtype).max)
         self.tables = make_tables(model, limits.max_steps + 2)
         after = [rule.m for rule in rules if isinstance(rule, AfterSteps)]
         self._varying = [m for m in after if not isinstance(m, int)]
@@ -198,43 +200,44 @@ class RepairEngine(ScalarEngine):
         if not self._call(valid, beliefs, location, SUM_TOLERANCE):
             self.model.check_state(y)
         streams = self._keys(belief, location, seed) if keys is None else np.ascontiguousarray(keys.numpy()).view(np.uint64)
-        candidates = self._candidates(controls, len(beliefs))
-        shape = candidates.shape[:2]
-        q, largest = np.empty(shape), float(torch.finfo(self.model.dtype).max)
+        every = self._every if controls is None else self._candidates(controls, len(beliefs))
+        shape = len(beliefs), every.shape[-2]
+        q = np.empty(shape)
 
         def run(rows: slice) -> int:
             own, steps = q[rows], 0
             costs, made = np.zeros((len(own), len(allocation.order), shape[1])), np.zeros(own.shape, np.int64)
             legal, rivals = np.zeros((2, *own.shape), np.bool_)
             # A copy: compiled loops take arrays of one layout, and candidates that all states share are laid out here alone.
-            tried = np.array(candidates[rows], order="C")
+            tried = every[None].repeat(len(own), 0) if controls is None else np.array(every[rows], order="C")
             states = Decisions(beliefs[rows], location[rows], streams[rows], tried, legal, costs, made, rivals, own)
-            for rounds in allocation.stretches():
+            for i, rounds in enumerate(allocation.stretches()):
+                if i and not rivals.any():
+                    break
                 more, wrong, finite = self._call_with_memory(
-                    decide, states, allocation.order, rounds, allocation.observations, allocation.clearly, largest
+                    decide, states, allocation.order, rounds, allocation.observations, allocation.clearly, self._largest
                 )
                 if wrong >= 0:
                     self._refuse()
                 if not finite:
-                    check_q_factors(torch.from_numpy(own).to(self.model.dtype), torch.from_numpy(legal))
+                    check_q_factors(torch.from_numpy(own).to(self._dtype), torch.from_numpy(legal))
                 steps += more
-                if not states.rivals.any():
-                    break
             return steps
 
         # Their trajectories' costs are kept until a state is decided. With a time for each, states are decided one by one.
         block = max(1, min(_STATES, _MOST_NUMBERS // (len(allocation.order) * shape[1])))
         return q, sum(self._threads(run, shape[0], block if allocation.seconds is None else 1))
 
-    def _candidates(self, controls: NDArray[np.int64] | None, count: int) -> NDArray[np.int64]:
-        """Candidates ``[N, C, R]`` of so many states: all joint controls if none are given."""
+    @cached_property
+    def _every(self) -> NDArray[np.int64]:
+        """All joint controls, ``[U, R]``."""
+        numbers = torch.arange(self.model.num_controls)
+        every: NDArray[np.int64] = digits(numbers, self.model.num_robot_controls, self.model.num_robots).numpy()
+        return every
+
+    def _candidates(self, controls: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+        """Candidates ``[N, C, R]`` of so many states, whose type and shape the loop does not check."""
         robots = self.model.num_robots
-        if controls is None:
-            if self._every is None:
-                every = torch.arange(self.model.num_controls)
-                self._every = digits(every, self.model.num_robot_controls, robots).numpy()
-            return np.broadcast_to(self._every, (count, *self._every.shape))
-        # The loop checks neither.
         if controls.dtype != np.int64 or controls.ndim != 3 or controls.shape[::2] != (count, robots) or not controls.shape[1]:
             raise ValueError(
                 f"controls must be int64 of shape ({count}, C, {robots}) with C at least 1, got {controls.dtype} of shape "
@@ -244,7 +247,7 @@ class RepairEngine(ScalarEngine):
 
     def _keys(self, belief: NDArray[Any], location: NDArray[np.int64], seed: int) -> NDArray[np.uint64]:
         # Adding zero turns -0.0, which compares equal to 0.0, into 0.0.
-        flat = belief.reshape(len(belief), self.model.num_locations * self.model.num_levels) + 0.0
+        flat = belief.reshape(len(belief), self._belief[0] * self._belief[1]) + 0.0
         bits = flat.view(np.int32 if belief.dtype == np.float32 else np.int64)
         keys = np.empty(len(belief), np.uint64)
         self._call(fingerprints, bits, location, np.uint64(seed % (1 << 64)), keys)
@@ -274,16 +277,14 @@ class RepairEngine(ScalarEngine):
 
     def _checked(self, y: TensorDictBase) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Beliefs ``[N, L, K]`` and locations ``[N, R]`` of states ``[*B]``, state after state; raises unless they fit."""
-        model = self.model
         check_instance("y", y, TensorDictBase)
         belief, location, shape = y.get("belief", None), y.get("location", None), y.batch_size
-        own = (model.num_locations, model.num_levels), (model.num_robots,)
-        for numbers, dtype, size in zip((belief, location), (model.dtype, torch.int64), own, strict=True):
+        for numbers, dtype, size in ((belief, self._dtype, self._belief), (location, torch.int64, self._location)):
             if not isinstance(numbers, Tensor) or numbers.dtype != dtype or numbers.shape != (*shape, *size):
-                model.check_state(y)
+                self.model.check_state(y)
         # States may lie in planes. A matrix is transposed by tiles; entry by entry that takes half of the time at L = 500.
-        beliefs = belief.detach().reshape(-1, model.num_locations * model.num_levels).contiguous().numpy()
-        return beliefs.reshape(-1, *own[0]), np.ascontiguousarray(location.numpy().reshape(-1, *own[1]))
+        beliefs = belief.detach().reshape(-1, self._belief[0] * self._belief[1]).contiguous().numpy()
+        return beliefs.reshape(-1, *self._belief), np.ascontiguousarray(location.numpy().reshape(-1, *self._location))
 
     def _call(self, function: Any, *args: Any) -> Any:
         return self._loops(function, *args)
