@@ -554,6 +554,19 @@ def test_labels_depend_on_the_state_alone(linear20):
             torch.set_num_threads(threads)
 
 
+def test_states_may_lie_in_memory_in_any_way(linear20):
+    y = linear20.start(torch.arange(12))
+    assert not y["belief"].is_contiguous()
+    rows = y.apply(torch.Tensor.contiguous)
+    apart = TensorDict({key: torch.stack([value, value], -1)[..., 0] for key, value in y.items()}, [12])
+    policy = RolloutPolicy(linear20.model, GreedyRepair(linear20.model), trajectories=3)
+    q, costs = policy.q_factors(y), policy.cost_to_go(y, torch.arange(12))
+    for each in (rows, apart):
+        assert torch.equal(policy.q_factors(each), q)
+        assert torch.equal(policy.cost_to_go(each, torch.arange(12)), costs)
+    assert torch.equal(policy.q_factors(y.view(3, 4)), q.view(3, 4, -1))
+
+
 def test_copies_have_a_loop_of_their_own(linear20):
     policy = RolloutPolicy(linear20.model, GreedyRepair(linear20.model))
     y = linear20.start(torch.arange(5))
