@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
@@ -129,8 +130,8 @@ class RepairEngine(ScalarEngine):
         self.policy, self.model, self.numbers, self.refresh = policy, model, numbers, refresh
         self._loops = Loops()
         self._spare: list[Work] = []
-        # What a model computes anew whenever it is asked takes a tenth of the time of a decision.
-        self._belief, self._location = (model.num_locations, model.num_levels), (model.num_robots,)
+        # Kept, as to look them up in the model takes time that a single decision feels.
+        self._belief_shape, self._location_shape = (model.num_locations, model.num_levels), (model.num_robots,)
         self._dtype, self._largest = model.dtype, float(torch.finfo(model.dtype).max)
         self.tables = make_tables(model, limits.max_steps + 2)
         after = [rule.m for rule in rules if isinstance(rule, AfterSteps)]
@@ -200,8 +201,8 @@ class RepairEngine(ScalarEngine):
         if not self._call(valid, beliefs, location, SUM_TOLERANCE):
             self.model.check_state(y)
         streams = self._keys(belief, location, seed) if keys is None else np.ascontiguousarray(keys.numpy()).view(np.uint64)
-        every = self._every if controls is None else self._candidates(controls, len(beliefs))
-        shape = len(beliefs), every.shape[-2]
+        candidates = self._every if controls is None else self._checked_candidates(controls, len(beliefs))
+        shape = len(beliefs), candidates.shape[1]
         q = np.empty(shape)
 
         def run(rows: slice) -> int:
@@ -209,7 +210,7 @@ class RepairEngine(ScalarEngine):
             costs, made = np.zeros((len(own), len(allocation.order), shape[1])), np.zeros(own.shape, np.int64)
             legal, rivals = np.zeros((2, *own.shape), np.bool_)
             # A copy: compiled loops take arrays of one layout, and candidates that all states share are laid out here alone.
-            tried = every[None].repeat(len(own), 0) if controls is None else np.array(every[rows], order="C")
+            tried = candidates.repeat(len(own), 0) if controls is None else np.array(candidates[rows], order="C")
             states = Decisions(beliefs[rows], location[rows], streams[rows], tried, legal, costs, made, rivals, own)
             for i, rounds in enumerate(allocation.stretches()):
                 if i and not rivals.any():
@@ -230,13 +231,13 @@ class RepairEngine(ScalarEngine):
 
     @cached_property
     def _every(self) -> NDArray[np.int64]:
-        """All joint controls, ``[U, R]``."""
-        numbers = torch.arange(self.model.num_controls)
+        """All joint controls, ``[1, U, R]``."""
+        numbers = torch.arange(self.model.num_controls).unsqueeze(0)
         every: NDArray[np.int64] = digits(numbers, self.model.num_robot_controls, self.model.num_robots).numpy()
         return every
 
-    def _candidates(self, controls: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-        """Candidates ``[N, C, R]`` of so many states, whose type and shape the loop does not check."""
+    def _checked_candidates(self, controls: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+        """Candidates ``[N, C, R]`` of so many states; raises unless they fit, which the loop does not check."""
         robots = self.model.num_robots
         if controls.dtype != np.int64 or controls.ndim != 3 or controls.shape[::2] != (count, robots) or not controls.shape[1]:
             raise ValueError(
@@ -247,7 +248,7 @@ class RepairEngine(ScalarEngine):
 
     def _keys(self, belief: NDArray[Any], location: NDArray[np.int64], seed: int) -> NDArray[np.uint64]:
         # Adding zero turns -0.0, which compares equal to 0.0, into 0.0.
-        flat = belief.reshape(len(belief), self._belief[0] * self._belief[1]) + 0.0
+        flat = belief.reshape(len(belief), math.prod(self._belief_shape)) + 0.0
         bits = flat.view(np.int32 if belief.dtype == np.float32 else np.int64)
         keys = np.empty(len(belief), np.uint64)
         self._call(fingerprints, bits, location, np.uint64(seed % (1 << 64)), keys)
@@ -279,12 +280,14 @@ class RepairEngine(ScalarEngine):
         """Beliefs ``[N, L, K]`` and locations ``[N, R]`` of states ``[*B]``, state after state; raises unless they fit."""
         check_instance("y", y, TensorDictBase)
         belief, location, shape = y.get("belief", None), y.get("location", None), y.batch_size
-        for numbers, dtype, size in ((belief, self._dtype, self._belief), (location, torch.int64, self._location)):
+        for numbers, dtype, size in ((belief, self._dtype, self._belief_shape), (location, torch.int64, self._location_shape)):
             if not isinstance(numbers, Tensor) or numbers.dtype != dtype or numbers.shape != (*shape, *size):
                 self.model.check_state(y)
         # States may lie in planes. A matrix is transposed by tiles; entry by entry that takes half of the time at L = 500.
-        beliefs = belief.detach().reshape(-1, self._belief[0] * self._belief[1]).contiguous().numpy()
-        return beliefs.reshape(-1, *self._belief), np.ascontiguousarray(location.numpy().reshape(-1, *self._location))
+        beliefs = belief.detach().reshape(-1, math.prod(self._belief_shape)).contiguous().numpy()
+        return beliefs.reshape(-1, *self._belief_shape), np.ascontiguousarray(
+            location.numpy().reshape(-1, *self._location_shape)
+        )
 
     def _call(self, function: Any, *args: Any) -> Any:
         return self._loops(function, *args)
