@@ -16,7 +16,7 @@ from tensordict import TensorDict
 
 from torchrl_pomdp.envs.repair import CalibratedStart, grid, line
 from torchrl_pomdp.identity import digest, identity
-from torchrl_pomdp.modules import PolicyNetwork, RolloutPolicy
+from torchrl_pomdp.modules import MultiagentRollout, PolicyNetwork, RolloutPolicy
 from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.problems import make_problem
 
@@ -90,10 +90,11 @@ def test_what_says_nothing_of_the_content_does_not_matter():
     assert digest(torch.arange(6).view(2, 3).T.contiguous()) == digest(torch.arange(6).view(2, 3).T)
     assert digest(torch.ones(2, requires_grad=True)) == digest(torch.ones(2))
     problem = make_problem("line3")
-    policy = RolloutPolicy(problem.model, network(0), trajectories=1)
-    before = digest(policy)
-    policy(problem.start(torch.arange(2)))
-    assert digest(policy) == before == digest(copy.deepcopy(policy)) == digest(policy.eval())
+    for kind in (RolloutPolicy, MultiagentRollout):
+        policy = kind(problem.model, network(0), trajectories=1)
+        before = digest(policy)
+        policy(problem.start(torch.arange(2)))
+        assert digest(policy) == before == digest(copy.deepcopy(policy)) == digest(policy.eval())
 
 
 def test_content_that_leads_back_to_itself_has_a_digest():

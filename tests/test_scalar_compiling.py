@@ -46,15 +46,26 @@ def test_random_numbers_are_those_of_tensors_to_the_last_bit(count):
 @outer
 def hashed(bits, out):
     for i in range(len(bits)):
-        out[i] = finished(hash_numbers(np.uint64(0), bits[i], 0))
+        out[i] = finished(hash_numbers(np.uint64(0), bits[i], 0, bits.itemsize == 8))
 
 
-def test_fingerprints_are_those_of_tensors():
+@pytest.mark.parametrize(("dtype", "bits"), [(torch.float32, np.int32), (torch.float64, np.int64)])
+def test_fingerprints_are_those_of_tensors(dtype, bits):
     from tensordict import TensorDict
 
-    belief, out = torch.rand(7, 5, generator=torch.Generator().manual_seed(0)), np.empty(7, np.uint64)
-    hashed(belief.numpy().view(np.int32), out)
+    belief, out = torch.rand(7, 5, generator=torch.Generator().manual_seed(0), dtype=dtype), np.empty(7, np.uint64)
+    hashed(belief.numpy().view(bits), out)
     assert torch.equal(torch.from_numpy(out.view(np.int64)), noise.fingerprint(TensorDict({"belief": belief}, [7])))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_states_that_are_known_have_fingerprints_of_their_own(dtype):
+    """Though the bits of 0, 1 and 0.5 are nearly all zero."""
+    from tensordict import TensorDict
+
+    known = torch.eye(3000, dtype=dtype)
+    mixed = (known + known.roll(1, 0)) / 2
+    assert noise.fingerprint(TensorDict({"belief": torch.cat([known, mixed])}, [6000])).unique().numel() == 6000
 
 
 def test_a_digest_tells_code_constants_and_what_is_called_apart():

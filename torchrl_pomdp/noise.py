@@ -150,10 +150,14 @@ def fingerprint(y: TensorDictBase) -> Tensor:
     offset = 0
     for key in sorted(y.keys(include_nested=True, leaves_only=True), key=str):
         leaf = y.get(key)
+        double = leaf.dtype == torch.float64
         if leaf.is_floating_point():
             # Adding zero turns -0.0, which compares equal to 0.0, into 0.0.
-            leaf = (leaf + 0.0).contiguous().view(torch.int64 if leaf.dtype == torch.float64 else torch.int32)
+            leaf = (leaf + 0.0).contiguous().view(torch.int64 if double else torch.int32)
         bits = leaf.reshape(*y.batch_size, leaf.shape[y.ndim :].numel()).to(torch.int64)
+        if double:
+            # The low bits of numbers such as 0.5 and 1 are all zero, and those of sums of their multiples would be.
+            bits = _mix(bits)
         index = torch.arange(offset, offset + bits.shape[-1], device=bits.device)
         total = total + (bits * (_mix(index + 1) | 1)).sum(-1)
         offset += bits.shape[-1]

@@ -4,12 +4,13 @@ from functools import partial
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import PendulumEnv
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
 from torchrl_pomdp.envs import BeliefEnv, FixedBelief
-from torchrl_pomdp.modules import RolloutPolicy, ZeroCost
+from torchrl_pomdp.modules import FlatEncoder, PolicyNetwork, RolloutPolicy, ZeroCost
 from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import make_problem, tiger
 
@@ -93,8 +94,6 @@ def test_resumes_from_its_state():
 
 
 def test_keeps_its_own_copy_of_the_policy(linear20):
-    from torchrl_pomdp.modules import FlatEncoder, PolicyNetwork
-
     network = PolicyNetwork(FlatEncoder(linear20.model), 3, (4, 3), generator=torch.Generator().manual_seed(0))
     data = [
         RolloutImprovement(make_env(), network, states=make_states(), frames_per_batch=6, total_frames=6, label=LABEL)
@@ -105,6 +104,23 @@ def test_keeps_its_own_copy_of_the_policy(linear20):
         for parameter in network.parameters():
             parameter.zero_()
     assert (next(iter(data[1])) == before).all()
+
+
+@pytest.mark.parametrize("take", [lambda new: (), lambda new: (new,), lambda new: (TensorDict.from_module(new),)])
+def test_the_policy_gets_the_weights_that_it_is_given(linear20, take):
+    """By default those that the caller's policy has now."""
+
+    def network(seed):
+        return PolicyNetwork(FlatEncoder(linear20.model), 3, (4,), generator=torch.Generator().manual_seed(seed))
+
+    given = network(0)
+    source = RolloutImprovement(make_env(), given, states=make_states(), frames_per_batch=6, label=LABEL)
+    next(iter(source))
+    given.load_state_dict(network(1).state_dict())
+    source.update_policy_weights_(*take(network(1)))
+    y = linear20.model.with_features(linear20.start(torch.arange(50)))
+    assert torch.equal(source.labeller.q_factors(y), LABEL(linear20.model, network(1)).q_factors(y))
+    assert not torch.equal(source.labeller.q_factors(y), LABEL(linear20.model, network(0)).q_factors(y))
 
 
 def test_tabular_models_are_labelled_by_the_same_collector():

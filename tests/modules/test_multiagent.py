@@ -66,6 +66,15 @@ def test_q_factors_are_counted(two, scheme):
     assert two.agent_mask(y).gather(-1, u.unsqueeze(-1)).all()
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_single_state_has_a_single_control(two, scheme):
+    y, policy = random_states(two, 3, 0), MultiagentRollout(two, GreedyRepair(two), scheme=scheme, trajectories=2)
+    alone, several = policy(y[1].clone()), policy(y.clone())
+    assert alone["action"].shape == ()
+    assert torch.equal(alone["action"], several["action"][1])
+    assert torch.equal(alone["q_factors"], several["q_factors"][1])
+
+
 @pytest.mark.parametrize("wrap", [lambda policy: policy, ByTensors], ids=["loop", "tensors"])
 def test_q_factors_are_those_of_joint_controls(two, wrap):
     """What a robot compares are entries of the joint table, at the others' controls."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 
 from torchrl_pomdp.cli import main
-from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, line
+from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.problems import Problem, make_problem
 
 
 def test_what_an_evaluation_cuts_does_not_outweigh_small_costs(capsys):
@@ -15,3 +17,11 @@ def test_what_an_evaluation_cuts_does_not_outweigh_small_costs(capsys):
     assert float(row.split("|")[2].split("±")[0]) == pytest.approx(20.0, abs=0.05)
     line3 = make_problem("line3")
     assert line3.evaluation_cost is line3.pessimistic_cost
+
+
+@pytest.mark.parametrize("robots", [1, 8])
+def test_a_problem_without_a_known_bound_finds_one(robots):
+    """Whatever eight robots do, of whose 6561 joint controls not all are tried: a stage costs up to 4 times 5."""
+    model = RepairModel(line(4), damage_chain((0.0, 0.5)), (0.0, 1.0, 5.0), 0.9, num_robots=robots)
+    problem = Problem(model, UniformStart(model, robots=(0,) * robots), base_policies={"greedy": GreedyRepair(model)})
+    assert 100.0 < problem.pessimistic_cost.cost < 200.1

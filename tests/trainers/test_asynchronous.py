@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -141,6 +142,39 @@ def test_an_interrupted_run_goes_on_from_the_last_versions(line3, tmp_path, monk
     assert len(json.loads((tmp_path / "run/versions.json").read_text())) == 2
     with pytest.raises(ValueError, match="staleness"):
         list(asynchronously(line3, staleness=2, folder=tmp_path / "run"))
+
+
+@pytest.mark.parametrize("lost", ["notes", "networks"])
+def test_what_is_lost_of_a_run_is_made_again(line3, tmp_path, lost):
+    """Without notes networks of the same version meet; where versions are lost, those that used to meet them are there."""
+    config, folder = replace(CONFIG, iterations=3), tmp_path / "run"
+    list(asynchronously(line3, config=config, folder=folder))
+    notes = folder / "versions.json"
+    if lost == "notes":
+        notes.unlink()
+    else:
+        # As if parts 1 to 5 had been slow.
+        notes.write_text(json.dumps([[2, 1, 1, 1, 1, 1], [3, 2, 2, 2, 2, 2], [3, 3, 3, 3, 3, 3]]))
+        for number in (2, 3):
+            path = folder / f"part-2/version-{number}.pt"
+            path.write_bytes(path.read_bytes()[:-20])
+    again = asynchronously(line3, config=config, folder=folder)
+    assert [iteration.number for iteration in again] == [1, 2, 3]
+    assert len(again.published) == 18
+    met = json.loads(notes.read_text())
+    assert met[-1] == [3] * 6
+    assert met[0] == ([1] * 6 if lost == "notes" else [2, 1, 1, 1, 1, 1])
+    assert all(one <= other for before, after in pairwise(met) for one, other in zip(before, after, strict=True))
+
+
+def test_iterations_whose_versions_are_not_known_have_those_of_their_number():
+    state = asynchronous._Progress([[None] * 6, [None] * 3], [], met=[[2, 1]])
+    assert state.meet()
+    assert state.met == [[2, 1], [5, 2]]
+    assert not state.meet()
+    state = asynchronous._Progress([[None] * 6, [None] * 5], [], met=[[3, 1]])
+    assert state.meet()
+    assert state.met == [[3, 1], [3, 2], [3, 3], [5, 4]]
 
 
 def test_what_stops_a_part_stops_all(line3, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -49,6 +50,10 @@ class Block(NamedTuple):
 _BLOCK = 16384
 # Most states of a batch, which is kept in memory.
 _LARGEST = 10**9
+
+
+# Arguments of ``update_policy_weights_`` that say where to take the weights from.
+_SOURCES = {"policy", "policy_weights", "weights", "weights_dict"}
 
 
 class LabelCollector(Collector):
@@ -133,8 +138,26 @@ class LabelCollector(Collector):
             total_frames=total_frames,
             **kwargs,
         )
+        # The collector below knows the copy alone.
+        self._given = weakref.ref(policy) if isinstance(policy, nn.Module) else None
         self.labeller = check_instance("label(model, policy)", label(self.env.model, self.policy), TensorDictModuleBase)
         self._batches, self.simulated_steps, self.seconds = 0, 0, 0.0
+
+    def update_policy_weights_(self, policy_or_weights: Any = None, **kwargs: Any) -> None:
+        """Give the policy that is simulated other weights.
+
+        Args:
+            policy_or_weights: the weights, or a module that has them; by default the policy that the collector was made with.
+            kwargs: see ``torchrl.collectors.Collector``.
+
+        Raises:
+            RuntimeError: by TorchRL, if there are no weights to take.
+        """
+        if policy_or_weights is None and not _SOURCES & kwargs.keys() and self._given is not None:
+            policy_or_weights = self._given()
+        if isinstance(policy_or_weights, nn.Module):
+            policy_or_weights = TensorDict.from_module(policy_or_weights)
+        super().update_policy_weights_(policy_or_weights, **kwargs)
 
     def rollout(self) -> TensorDictBase:
         """The next batch of labelled states, ``[frames_per_batch]``."""

@@ -6,7 +6,7 @@ iteration with application to autonomous sequential repair problems", Section II
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -122,6 +122,15 @@ class MultiagentRollout(SimulatedQFactors):
         self.signalling = signalling
         self.evaluated = 0
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the count: a copy starts its own."""
+        return {key: value for key, value in self.__dict__.items() if key != "evaluated"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The inverse of :meth:`__getstate__`."""
+        super().__setstate__(state)
+        self.evaluated = 0
+
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"q_factors"`` ``[*B, R, A]`` (costs, ``+inf`` where illegal) and ``"action"`` ``[*B, *S]``.
@@ -134,7 +143,7 @@ class MultiagentRollout(SimulatedQFactors):
         base = self._controls("base_policy", self.cost_to_go.base_policy, y)
         decide = {"one_at_a_time": self._in_turn, "order_optimised": self._best_first, "autonomous": self._at_once}
         controls, q = decide[self.scheme](y, base, model.agent_mask(y))
-        action = model.join_controls(controls).reshape(*shape, *model.control_shape)
+        action = model.join_controls(controls).reshape((*shape, *model.control_shape))
         return tensordict.set("action", action).set("q_factors", q.view(*shape, *q.shape[1:]))
 
     def _controls(self, name: str, policy: Policy, y: TensorDictBase) -> Tensor:

@@ -14,11 +14,13 @@ from torchrl_pomdp.checks import check_callable, check_instance, check_label, ch
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.generators import InPart, Mixture, RandomPlay
 from torchrl_pomdp.envs.partition import Partition, SinglePart
+from torchrl_pomdp.envs.rows import random_control
 from torchrl_pomdp.modules.agents import AgentEncoder, FlatAgentEncoder
 from torchrl_pomdp.modules.base_policies import Myopic, as_policy
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.rollout import Policy
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, ConstantCost, ZeroCost
+from torchrl_pomdp.noise import fold, uniform
 
 __all__ = ["Problem", "Symmetry"]
 
@@ -27,6 +29,8 @@ Symmetry = Callable[[TensorDictBase], TensorDictBase]
 
 # So many states of random play show the stage costs of a model without a known bound.
 _STATES = 2048
+# And so many joint controls of each, where there are too many to try them all.
+_DRAWS = 32
 # Stands for what is made of the model.
 _DEFAULT: Any = None
 
@@ -177,11 +181,16 @@ def _checked_symmetries(symmetries: Any) -> tuple[Symmetry, ...]:
 
 
 def _largest_cost(model: BeliefModel, start: StateGenerator) -> float:
-    """The largest absolute stage cost of any legal control in states of random play."""
-    y = RandomPlay(model, start)(torch.arange(_STATES, device=model.device))
+    """The largest absolute stage cost in states of random play: of any legal control, or of random ones of many agents."""
+    keys = torch.arange(_STATES, device=model.device)
+    y = RandomPlay(model, start)(keys)
     mask, live = model.action_mask(y), ~model.is_terminal(y)
     largest = 0.0
-    for control in range(model.num_controls):
-        cost = model.expected_cost(y, torch.full(y.batch_size, control, device=model.device)).abs()
-        largest = max(largest, float(cost.masked_fill(~(mask[:, control] & live), 0.0).max()))
+    for number in range(model.num_controls if model.enumerable else _DRAWS):
+        if model.enumerable:
+            u, counts = torch.full_like(keys, number), mask[:, number] & live
+        else:
+            agents = torch.arange(model.num_agents, device=model.device)
+            u, counts = random_control(mask, uniform(fold(keys, number).unsqueeze(-1), agents)), live
+        largest = max(largest, float(model.expected_cost(y, u).abs().masked_fill(~counts, 0.0).max()))
     return largest

@@ -107,10 +107,16 @@ def scenario_noise(key, group, member, count, first, name, step):
 
 
 @inner
-def hash_numbers(total, bits, offset):
-    """``total`` with the numbers ``bits``, entries from ``offset`` on, hashed into it; the last step is :func:`finished`."""
+def hash_numbers(total, bits, offset, double):
+    """``total`` with the numbers ``bits``, entries from ``offset`` on, hashed into it; the last step is :func:`finished`.
+
+    ``double``: whether they are the bits of numbers in double precision.
+    """
     for i in range(len(bits)):
-        total += np.uint64(bits[i]) * (_mix(np.uint64(offset + i + 1)) | _ONE)
+        number = np.uint64(bits[i])
+        if double:
+            number = _mix(number)
+        total += number * (_mix(np.uint64(offset + i + 1)) | _ONE)
     return total
 
 

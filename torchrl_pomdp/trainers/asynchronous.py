@@ -100,11 +100,14 @@ class _Progress:
         return [(p, block) for p, own in others for at, block in list(own.blocks) if at == index and block.summary[part]]
 
     def meet(self) -> bool:
-        """Note an iteration if all parts have come further; whether they have."""
-        further = min(self.versions()) > len(self.met)
-        if further:
-            self.met.append(self.versions())
-        return further
+        """Note the iterations that all parts have come to; whether there is another one."""
+        last, before = self.versions(), len(self.met)
+        while len(self.met) < min(last):
+            number = len(self.met) + 1
+            # What an interrupted run has noted may be lost: then it is not known which versions met, but that they could.
+            earlier = self.met[-1] if self.met else [0] * len(last)
+            self.met.append(last if number == min(last) else [max(number, own) for own in earlier])
+        return len(self.met) > before
 
 
 class AsynchronousIteration:
@@ -305,11 +308,13 @@ class AsynchronousIteration:
                 own.append(networks)
                 state.published.append(version)
         last = state.versions()
-        for versions in _noted(folder / _MET):
+        for number, versions in enumerate(_noted(folder / _MET), 1):
             # What is lost is made again.
-            if len(versions) == len(last) and all(0 < own <= there for own, there in zip(versions, last, strict=True)):
-                state.met.append(versions)
-        state.meet()
+            if len(versions) != len(last) or not all(number <= own <= there for own, there in zip(versions, last, strict=True)):
+                break
+            state.met.append(versions)
+        if state.meet():
+            self._note(state)
 
     def _kept(self, part: int, number: int, before: _Networks) -> tuple[Version, _Networks] | None:
         """A version of a part that was kept, given the one before."""

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from benchmarks.setting import by_tensors
 from torchrl_pomdp.envs import FunctionPartition, SinglePart
@@ -281,6 +282,22 @@ def test_double_precision_agrees(linear20):
     torch.testing.assert_close(q, own.q_factors(y), rtol=1e-12, atol=0)
 
 
+@pytest.mark.parametrize("policy", [GreedyRepair, UrgencyRepair])
+def test_in_double_precision_a_billionth_of_damage_is_damage(policy):
+    chain = damage_chain((0.0, 0.02, 0.03, 0.05))
+    model = RepairModel(line(3), chain, COSTS, 0.99, terminal_probability=0.0, dtype=torch.float64)
+    belief = torch.tensor([[1 - 1e-9, 0, 0, 0, 1e-9], [1.0, 0, 0, 0, 0], [0.5, 0.5, 0, 0, 0]], dtype=torch.float64)
+    y = model.derive(TensorDict({"belief": belief[None], "location": torch.zeros(1, 1, dtype=torch.int64)}, [1]))
+    assert y["action_mask"].tolist() == [[True, False, True]]
+
+    def make():
+        return RolloutPolicy(model, policy(model))
+
+    q = make().q_factors(y)
+    assert torch.equal(q.isfinite(), y["action_mask"])
+    torch.testing.assert_close(q, without(make).q_factors(y), rtol=1e-12, atol=0)
+
+
 # ---- closed forms --------------------------------------------------------------------------------------------------------
 
 
@@ -398,14 +415,16 @@ def test_old_policies_that_are_left_to_tensors(linear20):
     assert RolloutPolicy(old, OldPolicy(lambda y: y, old, old)).cost_to_go.scalar is None
 
 
-def test_networks_that_are_trained_further_are_read_again(linear20):
+@pytest.mark.parametrize("written", [lambda p: p, lambda p: p.data], ids=["as such", "through data"])
+def test_networks_that_are_trained_further_are_read_again(linear20, written):
+    """Also where PyTorch counts no new version, as where TorchRL sends weights to a collector."""
     model = linear20.model
     policy = networks(model)
     cost, y, keys = TruncatedRollout(model, policy), linear20.start(torch.arange(8)), torch.arange(8)
     before = cost(y, keys)
     with torch.no_grad():
         for parameter in policy.parameters():
-            parameter.mul_(-1.0)
+            written(parameter).mul_(-1.0)
     after = cost(y, keys)
     assert not torch.equal(before, after)
     assert_close(after, without(lambda: TruncatedRollout(model, policy))(y, keys))
@@ -444,6 +463,8 @@ def test_what_the_loop_does_not_know_is_left_to_tensors(linear20):
 
     own = model.with_partition(FunctionPartition(["even", "odd"], lambda y: y["location"][..., 0] % 2))
     single = PolicyNetwork(RelativeEncoder(model), 3, (8,), generator=torch.Generator().manual_seed(0))
+    smooth = copy.deepcopy(single)
+    smooth.network[1] = nn.Tanh()
     greedy = GreedyRepair(model)
     zero = {"terminal_cost": ZeroCost()}
     for rollout_of in (
@@ -451,6 +472,7 @@ def test_what_the_loop_does_not_know_is_left_to_tensors(linear20):
         lambda: TruncatedRollout(own, greedy, truncation=OnLeaving(), **zero),
         lambda: TruncatedRollout(model, PartitionedPolicy([greedy, UrgencyRepair(model)] * 3)),
         lambda: TruncatedRollout(own, networks(model)),
+        lambda: TruncatedRollout(model, smooth),
         lambda: TruncatedRollout(model, greedy, max_steps=1_000_000, **zero),
         lambda: TruncatedRollout(RepairModel(line(20), damage_chain((0.0, 0.1, 0.1, 0.1)), (0, 1, 1, 1, 1), 0.9), greedy),
         lambda: TruncatedRollout(model, lambda y: greedy(y)),

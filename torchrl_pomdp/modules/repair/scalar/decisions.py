@@ -61,13 +61,13 @@ def _some(flags):
 
 
 @inner
-def _control_mask(tables, start, location, controls, mask):
-    """Put into ``mask`` ``[C]`` which candidates ``[C, R]`` are legal."""
+def _control_mask(tables, precision, start, location, controls, mask):
+    """Put into ``mask`` ``[C]`` which candidates ``[C, R]`` are legal; ``precision`` is the model's type of numbers."""
     for u in range(len(mask)):
         fits = True
         for robot in range(len(location)):
             place = location[robot]
-            fits = fits and legal_at(tables, place, np.float32(start[place, 0]) == np.float32(1.0), controls[u, robot])
+            fits = fits and legal_at(tables, place, precision(start[place, 0]) == 1.0, controls[u, robot])
         mask[u] = fits
 
 
@@ -198,7 +198,7 @@ def decide(policy, tables, limits, work, states, order, rounds, observations, cl
         costs, made, rivals = states.costs[row], states.made[row], states.rivals[row]
         controls, mask = states.controls[row], states.legal[row]
         set_initial(start, work.initial)
-        _control_mask(tables, start, origin, controls, mask)
+        _control_mask(tables, work.intact.dtype.type, start, origin, controls, mask)
         spent = _largest(made)
         if spent == 0:
             for u in range(len(rivals)):

@@ -308,7 +308,7 @@ class RepairEngine(ScalarEngine):
             initial=np.empty(size, np.int64),
             level=np.empty(size, np.int64),
             since=np.empty(size, np.int64),
-            intact=np.empty(size, np.float32),
+            intact=np.empty(size, np.float32 if self._dtype == torch.float32 else np.float64),
             controls=np.empty(robots, np.int64),
             seen=np.empty(robots, np.int64),
             numbers=np.empty(self.numbers, np.float32),

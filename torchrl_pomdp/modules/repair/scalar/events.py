@@ -15,7 +15,7 @@ __all__ = ["bits_after", "interval_cost", "level_at", "look", "moved", "set_inta
 def set_intact(view):
     """Bring up to date, for all locations, the probability that they are intact."""
     for place in range(len(view.level)):
-        view.intact[place] = np.float32(probability(view, place, 0))
+        view.intact[place] = probability(view, place, 0)
 
 
 @inner

@@ -17,6 +17,7 @@ from torchrl_pomdp.modules.networks import PolicyNetwork
 from torchrl_pomdp.modules.repair.encoders import RelativeEncoder
 from torchrl_pomdp.modules.repair.scalar.engine import RepairEngine, repair_engine
 from torchrl_pomdp.modules.repair.scalar.twins import greedy, networks, random
+from torchrl_pomdp.modules.rowwise import RowLinear
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, scalar_engine
 
 __all__ = ["network_engine"]
@@ -26,7 +27,7 @@ def network_engine(policies: Sequence[Any], model: RepairModel, limits: Limited)
     """The engine of local policies, one for each part, of which some are networks; None where there is no twin for them.
 
     Args:
-        policies: networks of equal sizes and in single precision, which see the state by one :class:`RelativeEncoder` or
+        policies: ReLU networks of equal sizes and in single precision, which see the state by one :class:`RelativeEncoder` or
             :class:`~torchrl_pomdp.modules.FlatEncoder`; and at most one other policy, which has a twin. None: any legal
             control.
         model: the model that is simulated.
@@ -73,10 +74,12 @@ def _features(encoder: Any, model: RepairModel) -> tuple[NDArray[np.int64], NDAr
 
 
 def _alike(own: Sequence[PolicyNetwork]) -> bool:
-    """Whether all networks have one encoder, and the same sizes in single precision."""
+    """Whether all networks have one encoder, the same sizes in single precision, and ReLUs between linear layers alone."""
+    layers = [tuple(map(type, network.network)) for network in own]
+    plain = all(kinds == (*(RowLinear, nn.ReLU) * (len(kinds) // 2), RowLinear) for kinds in layers)
     shapes = [[tuple(p.shape) for p in network.network.parameters()] for network in own]
     single = all(p.dtype == torch.float32 for network in own for p in network.network.parameters())
-    return single and all(network.encoder is own[0].encoder for network in own) and all(each == shapes[0] for each in shapes)
+    return plain and single and all(n.encoder is own[0].encoder for n in own) and all(each == shapes[0] for each in shapes)
 
 
 class _Weights:
@@ -88,11 +91,13 @@ class _Weights:
         sizes = [(len(each), each[0].in_features, each[0].out_features) for each in self.layers]
         self.weights = tuple(np.empty(size, np.float32) for size in sizes)
         self.biases = tuple(np.empty((count, size), np.float32) for count, _, size in sizes)
-        self._versions: list[tuple[int, int]] = []
+        # As they were copied. Versions of tensors do not tell: what is written through ``.data`` raises none.
+        self._copied: list[torch.Tensor] = []
 
     def refresh(self) -> None:
         """Copy the weights again if they have changed."""
-        if (versions := self._now()) == self._versions:
+        now = [p.detach() for each in self.layers for layer in each for p in (layer.weight, layer.bias)]
+        if self._copied and all(map(torch.equal, now, self._copied)):
             return
         for each, weight, bias in zip(self.layers, self.weights, self.biases, strict=True):
             for number, layer in enumerate(each):
@@ -102,7 +107,4 @@ class _Weights:
                 if not np.isfinite(values).all():
                     wrong = values[~np.isfinite(values)][0]
                     raise ValueError(f"logits of a network must be finite, got {wrong}: a weight is no number")
-        self._versions = versions
-
-    def _now(self) -> list[tuple[int, int]]:
-        return [(p.data_ptr(), p._version) for each in self.layers for layer in each for p in (layer.weight, layer.bias)]
+        self._copied = [p.clone() for p in now]

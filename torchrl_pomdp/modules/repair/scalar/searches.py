@@ -84,7 +84,7 @@ def _recall(data, state, row):
         level = np.int64(row[1 + robots + place])
         work.level[place], work.since[place] = level, np.int64(row[1 + robots + size + place])
         # Right where no level leads to level 0; else all are computed anew.
-        work.intact[place] = np.float32(level == 0) if level >= 0 else np.float32(state.belief[place, 0])
+        work.intact[place] = state.belief[place, 0] if level < 0 else 1.0 if level == 0 else 0.0
     _refresh(data[0], state)
 
 

@@ -21,8 +21,8 @@ def fingerprints(bits, locations, seed, keys):
         keys: uint64 ``[N]``.
     """
     for row in range(len(keys)):
-        total = hash_numbers(np.uint64(0), bits[row], 0)
-        total = hash_numbers(total, locations[row], bits.shape[1])
+        total = hash_numbers(np.uint64(0), bits[row], 0, bits.itemsize == 8)
+        total = hash_numbers(total, locations[row], bits.shape[1], False)
         keys[row] = fold(finished(total), seed)
 
 

@@ -79,7 +79,7 @@ class Work(NamedTuple):
     initial: NDArray[np.int64]
     level: NDArray[np.int64]
     since: NDArray[np.int64]
-    intact: NDArray[np.float32]
+    intact: NDArray[np.floating]
     controls: NDArray[np.int64]
     seen: NDArray[np.int64]
     numbers: NDArray[np.float32]
@@ -155,7 +155,7 @@ def begin(work, start, origin):
     for robot in range(len(origin)):
         work.location[robot] = origin[robot]
     for place in range(start.shape[0]):
-        work.level[place], work.since[place], work.intact[place] = work.initial[place], 0, np.float32(start[place, 0])
+        work.level[place], work.since[place], work.intact[place] = work.initial[place], 0, start[place, 0]
 
 
 @inner

@@ -85,7 +85,7 @@ class View(NamedTuple):
         location: where the robots are, ``[R]``.
         level: level of every location when it was last seen, -1 where it has not been, ``[L]``.
         since: the stage of that, ``[L]``.
-        intact: probability now that a location is intact, ``[L]``.
+        intact: probability now that a location is intact, in the model's precision, ``[L]``.
         start: belief in which the trajectory started, ``[L, K]``.
         tables: the model.
         work: numbers for the twin's own use, which it finds as it left them in the same trajectory or in another one.
@@ -96,7 +96,7 @@ class View(NamedTuple):
     location: NDArray[np.int64]
     level: NDArray[np.int64]
     since: NDArray[np.int64]
-    intact: NDArray[np.float32]
+    intact: NDArray[np.floating]
     start: NDArray[np.float64]
     tables: Tables
     work: NDArray[np.float32]
@@ -129,8 +129,8 @@ def expected_cost(view, place):
 
 @inner
 def intact(view, place, threshold):
-    """Whether a location is intact but for a probability up to ``threshold``, in single precision."""
-    return view.intact[place] + np.float32(threshold) >= np.float32(1.0)
+    """Whether a location is intact but for a probability up to ``threshold``, in the model's precision."""
+    return view.intact[place] + view.intact.dtype.type(threshold) >= 1.0
 
 
 @inner
