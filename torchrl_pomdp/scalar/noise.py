@@ -11,15 +11,15 @@ import numpy as np
 
 from torchrl_pomdp.modules.scenarios import BITS, LARGEST, STEPS
 from torchrl_pomdp.noise import FACTOR, GOLDEN, ROUNDS, STEP
-from torchrl_pomdp.scalar.compiling import inner
+from torchrl_pomdp.scalar.compiling import inner, outer
 
-__all__ = ["CONTROLS", "Noise", "fold", "hash_numbers", "scenario_noise", "uniform", "variable_bit"]
+__all__ = ["CONTROLS", "Noise", "fold", "hash_numbers", "hash_words", "scenario_noise", "uniform", "variable_bit"]
 
 _GOLDEN, _FIRST, _SECOND = np.uint64(GOLDEN), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _FACTOR, _STEP, _STEPS = np.uint64(FACTOR), np.uint64(STEP), np.uint64(STEPS)
 CONTROLS = np.uint64(0x636F6E74)
 """Folded into a key, it sets the numbers of random controls apart from those of observations."""
-_ONE, _ROUNDS, _BITS = np.uint64(1), ROUNDS, BITS
+_ONE, _WORD, _ROUNDS, _BITS = np.uint64(1), np.uint64(0xFFFFFFFF), ROUNDS, BITS
 _UNIT, _LARGEST = np.float32(2.0**-24), np.float32(LARGEST)
 
 
@@ -117,6 +117,17 @@ def hash_numbers(total, bits, offset, double):
         if double:
             number = _mix(number)
         total += number * (_mix(np.uint64(offset + i + 1)) | _ONE)
+    return total
+
+
+@outer
+def hash_words(arrays):
+    """Hash of several arrays of 32-bit words, uint32, as fast as they can be read."""
+    total = np.uint64(0)
+    for words in arrays:
+        total = _mix(total)
+        for i in range(len(words)):
+            total += np.uint64(words[i]) * ((np.uint64(i) * _GOLDEN & _WORD) | _ONE)
     return total
 
 

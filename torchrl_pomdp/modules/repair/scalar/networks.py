@@ -19,6 +19,8 @@ from torchrl_pomdp.modules.repair.scalar.engine import RepairEngine, repair_engi
 from torchrl_pomdp.modules.repair.scalar.twins import greedy, networks, random
 from torchrl_pomdp.modules.rowwise import RowLinear
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, scalar_engine
+from torchrl_pomdp.scalar.compiling import Loops
+from torchrl_pomdp.scalar.noise import hash_words
 
 __all__ = ["network_engine"]
 
@@ -91,13 +93,23 @@ class _Weights:
         sizes = [(len(each), each[0].in_features, each[0].out_features) for each in self.layers]
         self.weights = tuple(np.empty(size, np.float32) for size in sizes)
         self.biases = tuple(np.empty((count, size), np.float32) for count, _, size in sizes)
-        # As they were copied. Versions of tensors do not tell: what is written through ``.data`` raises none.
-        self._copied: list[torch.Tensor] = []
+        # Where the layers keep them, and a hash of what was copied from there.
+        self._where: list[int] = []
+        self._memory: tuple[NDArray[np.uint32], ...] = ()
+        self._copied: int | None = None
+        self._loops = Loops()
 
     def refresh(self) -> None:
-        """Copy the weights again if they have changed."""
-        now = [p.detach() for each in self.layers for layer in each for p in (layer.weight, layer.bias)]
-        if self._copied and all(map(torch.equal, now, self._copied)):
+        """Copy the weights again if they have changed.
+
+        Versions of tensors do not tell: what is written through ``.data``, as TorchRL does, raises none.
+        """
+        now = [p for each in self.layers for layer in each for p in (layer.weight, layer.bias)]
+        where = [p.data_ptr() for p in now]
+        if where != self._where or not all(p.is_contiguous() for p in now):
+            self._where, self._memory = where, tuple(p.detach().numpy().reshape(-1).view(np.uint32) for p in now)
+        content = self._loops(hash_words, self._memory)
+        if content == self._copied:
             return
         for each, weight, bias in zip(self.layers, self.weights, self.biases, strict=True):
             for number, layer in enumerate(each):
@@ -107,4 +119,4 @@ class _Weights:
                 if not np.isfinite(values).all():
                     wrong = values[~np.isfinite(values)][0]
                     raise ValueError(f"logits of a network must be finite, got {wrong}: a weight is no number")
-        self._copied = [p.clone() for p in now]
+        self._copied = content
