@@ -66,8 +66,10 @@ def test_random_controls_are_legal(name, batch):
     collector.shutdown()
 
 
-def test_parallel_environments_draw_legal_controls():
-    env = ParallelEnv(2, partial(make, (3,)))
+@pytest.mark.parametrize("way", ["partial", "lambda"])
+def test_parallel_environments_draw_legal_controls(way):
+    """A lambda is sent to another process with the specs of the environment that it makes."""
+    env = ParallelEnv(2, partial(make, (3,)) if way == "partial" else lambda: make((3,)))
     try:
         check_env_specs(env)
         assert_legal(env.rollout(60, break_when_any_done=False))

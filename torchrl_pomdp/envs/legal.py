@@ -37,6 +37,20 @@ class _Current:
         self.generator = generator
         self.mask: Tensor | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """With the generator as plain bytes: another process cannot open a generator that is sent to it."""
+        generator = self.generator
+        content = None if generator is None else (str(generator.device), generator.get_state().numpy().tobytes())
+        return {"mask": self.mask, "generator": content}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """The inverse of :meth:`__getstate__`."""
+        self.mask, self.generator = state["mask"], None
+        if state["generator"] is not None:
+            device, content = state["generator"]
+            self.generator = torch.Generator(device)
+            self.generator.set_state(torch.frombuffer(bytearray(content), dtype=torch.uint8))
+
     def source(self, device: torch.device) -> torch.Generator:
         """Where random numbers come from; if nobody gave a generator, from a new one, seeded by the operating system."""
         if self.generator is None:

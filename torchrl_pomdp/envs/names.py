@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from torchrl_pomdp.checks import check_choice, check_integer, check_sequence
 
 __all__ = ["name_of", "number_of"]
@@ -25,7 +28,7 @@ def number_of(what: str, given: Any, names: Sequence[str] | None, count: int) ->
 
     Args:
         what: name of the argument.
-        given: a number, or a name.
+        given: a number, also as a tensor of no dimension, or a name.
         names: the names, where there are some.
         count: how many there are.
 
@@ -36,12 +39,16 @@ def number_of(what: str, given: Any, names: Sequence[str] | None, count: int) ->
     Examples:
         >>> number_of("control", "listen", ("listen", "open left"), 2)
         0
+        >>> number_of("observation", torch.tensor(1), None, 2)
+        1
         >>> number_of("observation", 5, None, 2)
         Traceback (most recent call last):
         ValueError: observation must be at most 1, got 5
     """
     if names is not None:
         check_sequence(f"names of {what}s", names, str, count)
+    if isinstance(given, Tensor) and given.shape == () and given.dtype == torch.int64:
+        given = int(given)
     if not isinstance(given, str):
         return check_integer(what, given, 0, count - 1)
     if names is None:

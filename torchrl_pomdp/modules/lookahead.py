@@ -24,7 +24,13 @@ class RolloutPolicy(SimulatedQFactors):
         base_policy: :math:`\mu`, writes ``"action"``.
 
     Keyword Args:
-        options: see :class:`~torchrl_pomdp.modules.qfactors.SimulatedQFactors`.
+        trajectories: simulated trajectories for each control, 10 by default.
+        allocation: ``"uniform"``, or ``"adaptive"``, which gives no more of them to a control that is clearly beaten.
+        seconds: time for the decision of a state.
+        truncation: where simulations are cut, and ``max_steps``: when.
+        terminal_cost: :math:`\hat J`, added at the cut.
+        seed: seed of the simulations.
+        options: for these and all others see :class:`~torchrl_pomdp.modules.qfactors.SimulatedQFactors`.
 
     Raises:
         TypeError: if an argument is of the wrong kind.
