@@ -29,7 +29,7 @@ from torchrl_pomdp.kept import keep, own_result
 from torchrl_pomdp.modules import PolicyNetwork, ValueNetwork
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.threads import kept_threads
-from torchrl_pomdp.noise import fold
+from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.tensor_checks import device_of
@@ -157,6 +157,11 @@ def seeded(device: torch.device, seed: int) -> Iterator[None]:
         yield
 
 
+def _apart(seed: int) -> int:
+    """A seed whose stream is another one."""
+    return int(seed_keys(seed, torch.tensor(0))) & (2**63 - 1)
+
+
 class Training:
     """Networks, environment and loss of a training.
 
@@ -172,7 +177,9 @@ class Training:
         self.problem, self.count, self.seed, self.episodes = problem, count, seed, episodes
         self.done = 0
         self.policy = cast(PolicyNetwork, make_networks(problem, config, seed).policies[0])
-        self.value = cast(ValueNetwork, make_values(problem, config, seed, self.policy.encoder).values[0])
+        # Not the weights of the policy network.
+        other = _apart(seed)
+        self.value = cast(ValueNetwork, make_values(problem, config, other, self.policy.encoder).values[0])
         for network in (self.policy, self.value):
             _shrink(network)
         self.actor = self.policy.actor()
@@ -208,7 +215,8 @@ class Training:
         """Steps of the policy as it is, ``[episodes, stages]``, of new episodes, until these end or all batches are made."""
         model, left, number = self.problem.model, min(SEGMENT, self.count - self.done), self.done // SEGMENT
         seed = int(fold(torch.tensor(self.seed), number)) & (2**63 - 1) if number else self.seed
-        env = BeliefEnv(model, self.problem.start, batch_size=(self.episodes,), seed=seed)
+        # What is observed does not follow from the random numbers that controls are drawn with.
+        env = BeliefEnv(model, self.problem.start, batch_size=(self.episodes,), seed=_apart(seed))
         with seeded(model.device, seed):
             collector = Collector(
                 TransformedEnv(env, _SpreadCounter(max_steps=model.horizon)),
