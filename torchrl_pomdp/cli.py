@@ -203,7 +203,7 @@ class Problems:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command with ``args`` (default: the process's); returns the exit status: 2 for input that was refused, 1 for
-    work that has failed elsewhere.
+    work that has failed elsewhere, 130 for Ctrl-C.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         # What a terminal cannot show is no reason to lose a table.
@@ -252,6 +252,10 @@ def main(args: list[str] | None = None) -> int:
     except WorkerError as error:
         print(f"torchrl-pomdp: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        goes_on = isinstance(command, (Train, Compare, Reproduce))
+        print(f"\ntorchrl-pomdp: interrupted{'; the same command goes on' if goes_on else ''}", file=sys.stderr)
+        return 130
     return 0
 
 

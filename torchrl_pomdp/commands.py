@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
@@ -20,7 +19,7 @@ from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.envs.repair import RepairModel, save_animation, trajectory_figure
 from torchrl_pomdp.evaluation import Comparison, discounted_costs
 from torchrl_pomdp.evaluation import compare as compare_costs
-from torchrl_pomdp.files import check_folder, read_text, write_bytes, write_json
+from torchrl_pomdp.files import check_folder, write_bytes, write_json
 from torchrl_pomdp.modules import Policy
 from torchrl_pomdp.modules.rollout import MAX_STEPS
 from torchrl_pomdp.noise import fold, seed_keys
@@ -30,11 +29,12 @@ from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, peer_figure, peer_table, ratio_texts, table
 from torchrl_pomdp.report.page import write_report
 from torchrl_pomdp.report.player import side_by_side
-from torchrl_pomdp.report.run_folder import read_run_folder
+from torchrl_pomdp.report.run_folder import read_iterations, read_run_folder
 from torchrl_pomdp.reproduce import EXPERIMENTS
 from torchrl_pomdp.reproduce import reproduce as reproduce_experiment
 from torchrl_pomdp.tensor_checks import check_device
 from torchrl_pomdp.trainers import compare_peers, load_checkpoint, r_nt
+from torchrl_pomdp.trainers.ppo import BATCH
 from torchrl_pomdp.trainers.run import TrainingRun
 from torchrl_pomdp.workers import LOCAL, Workers
 
@@ -53,7 +53,7 @@ def train(command: Train) -> None:
     numbers: dict[str, Any] = {
         name: getattr(command, name) for name in ("states", "rollout_states", "online_states", "staleness")
     }
-    run = TrainingRun(given, command.algorithm, command.base or given.baseline, config, **numbers)
+    run = TrainingRun(given, command.algorithm, cast(str, command.base), config, **numbers)
     problem = run.problem
     default = Path("runs") / f"{problem.name}-{command.algorithm}-{run.base}-seed{config.seed}"
     out = check_folder("out", command.out or default)
@@ -212,12 +212,10 @@ def changes(command: Changes) -> None:
 
 
 def _simulated_steps(folder: Path) -> int | None:
-    """Belief steps that the labels of a run took; None where the folder does not say."""
-    path = folder / "iterations.json"
-    if not path.is_file():
-        return None
-    iterations = json.loads(read_text(path))
-    return sum(part["simulated_steps"] for iteration in iterations for part in iteration["parts"].values())
+    """Belief steps that the labels of a run took, but no fewer than PPO takes; None where the folder does not say."""
+    iterations = read_iterations(folder / "iterations.json")
+    steps = sum(part["simulated_steps"] for iteration in iterations for part in iteration["parts"].values())
+    return max(steps, BATCH) if iterations else None
 
 
 def reproduce(command: Reproduce) -> None:

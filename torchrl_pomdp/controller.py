@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cached_property
 from os import PathLike
 from typing import Any, NamedTuple
 
@@ -12,6 +13,8 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_mapping, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.partition import SinglePart
+from torchrl_pomdp.identity import digest
 from torchrl_pomdp.modules.rollout import Policy, controls_of
 
 __all__ = ["Controller", "Decision"]
@@ -196,7 +199,7 @@ class Controller:
         """
         y = self.state
         entries = {str(key): y.get(key).tolist() for key in self.model.state_keys}
-        return json.dumps({"format": _FORMAT, "model": self.model.describe(), "steps": self._steps, "state": entries})
+        return json.dumps({"format": _FORMAT, **self._of_model, "steps": self._steps, "state": entries})
 
     def load_json(self, text: str) -> None:
         """Go on from a state that :meth:`to_json` gave.
@@ -208,17 +211,22 @@ class Controller:
         check_instance("text", text, str)
         try:
             given = check_mapping("text", json.loads(text), object)
-            if given["format"] != _FORMAT or given["model"] != self.model.describe():
-                raise ValueError(f"it is {shown(given['format'])} of {shown(given['model'])}")
+            if given["format"] != _FORMAT or any(given[key] != own for key, own in self._of_model.items()):
+                raise ValueError(f"it is {shown(given['format'])} of {shown(given['model'])}, {shown(given['digest'])}")
             steps = check_integer("steps", given["steps"], 0)
             entries = check_mapping("state", given["state"], (list, int, float))
             spec = self.model.state_spec()
             core = {key: _tensor(key, entries[key], spec[key].dtype) for key in self.model.state_keys}
             state = self._single("state", TensorDict(core, batch_size=()))
         except (TypeError, ValueError, KeyError, RuntimeError, OverflowError) as error:
-            described = self.model.describe()
+            described = ", ".join(self._of_model.values())
             raise ValueError(f"text must be what to_json gave for the model {described}: {error}") from error
         self._state, self._steps = state, steps
+
+    @cached_property
+    def _of_model(self) -> dict[str, str]:
+        """Whose state a text is: the model's, however a policy divides it."""
+        return {"model": self.model.describe(), "digest": digest(self.model.with_partition(SinglePart()))}
 
     def _single(self, name: str, y: TensorDictBase) -> TensorDictBase:
         """A copy of the core of a single feature state, checked."""

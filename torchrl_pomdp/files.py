@@ -9,6 +9,8 @@ import os
 import secrets
 import tempfile
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,8 +66,13 @@ def write_bytes(path: str | PathLike[str], content: bytes) -> None:
         ...     (Path(folder) / "a.txt").read_text()
         'whole'
     """
-    path = check_path("path", path)
-    check_instance("content", content, bytes)
+    with _written(check_path("path", path), check_instance("content", content, bytes)) as temporary:
+        os.replace(temporary, path)
+
+
+@contextmanager
+def _written(path: Path, content: bytes) -> Iterator[Path]:
+    """A new temporary file beside ``path`` with ``content``; removed afterwards if it is still there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem[:64]}.{secrets.token_hex(8)}{path.suffix}")
     handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
@@ -74,13 +81,11 @@ def write_bytes(path: str | PathLike[str], content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(handle)
-        os.replace(temporary, path)
+        yield temporary
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise OSError(error.errno, error.strerror, str(path)) from error
-    except BaseException:
+    finally:
         temporary.unlink(missing_ok=True)
-        raise
 
 
 def check_folder(name: str, path: str | PathLike[str]) -> Path:
@@ -235,15 +240,12 @@ def _differing(found: dict[str, Any], given: dict[str, Any]) -> list[str]:
 
 def _write_new(path: Path, content: bytes) -> bool:
     """Write a file that nobody else has written meanwhile, whole or not at all; False where somebody has."""
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
-    write_bytes(temporary, content)
     try:
-        # Unlike a renaming, a link does not replace what is there.
-        os.link(temporary, path)
+        with _written(path, content) as temporary:
+            # Unlike a renaming, a link does not replace what is there.
+            os.link(temporary, path)
     except FileExistsError:
         return False
-    finally:
-        temporary.unlink(missing_ok=True)
     return True
 
 
@@ -295,7 +297,7 @@ def _check_content(name: str, value: Any, tensor: type) -> None:
     if isinstance(value, dict):
         for key, entry in value.items():
             _check_content(f"{name}[{shown(key)}]", entry, tensor)
-    elif not isinstance(value, (tensor, str, int, float, type(None))):
+    elif not isinstance(value, tensor) and type(value) not in (str, int, float, bool, type(None)):
         raise TypeError(f"{name} must be a tensor, a number, a text or a dictionary of them, got {shown(value)}")
 
 

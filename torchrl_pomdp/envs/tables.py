@@ -230,7 +230,7 @@ def table(
         raise TypeError(f"{name} must be dense or sparse in COO layout, got {rows.layout}")
     rows = rows.double()
     sums = rows.sum(-1, keepdim=True)
-    _check_rows(name, rows, sums.squeeze(-1))
+    _check_rows(name, rows.amin(-1), sums.squeeze(-1))
     return DenseTable(torch.where(_off(sums, dtype), rows / sums, rows), dtype, device)
 
 
@@ -242,17 +242,21 @@ def _sparse(name: str, rows: Tensor, dtype: torch.dtype, device: torch.device | 
     index, values = rows.indices(), rows.values()
     row = index[0] * rows.shape[1] + index[1]
     sums = torch.zeros(rows.shape[:2], dtype=torch.float64).flatten().index_add_(0, row, values)
-    _check_rows(name, values, sums.view(rows.shape[:2]))
+    least = torch.zeros_like(sums).scatter_reduce_(0, row, values, "amin")
+    _check_rows(name, least.view(rows.shape[:2]), sums.view(rows.shape[:2]))
     scaled = torch.where(_off(sums, dtype)[row], values / sums[row], values)
     return SparseTable(rows.shape, index[:, values > 0], scaled[values > 0], dtype, device)
 
 
-def _check_rows(name: str, values: Tensor, sums: Tensor) -> None:
-    """Raise unless rows with numbers ``values`` and sums ``[U, n]`` are distributions up to rounding."""
+def _check_rows(name: str, least: Tensor, sums: Tensor) -> None:
+    """Raise unless rows with least numbers ``least`` and sums ``sums``, ``[U, n]``, are distributions up to rounding."""
     off = (sums - 1.0).abs()
-    if not bool((values >= 0).all()) or not bool((off <= _TOLERANCE).all()):
-        where = tuple(int(k) for k in torch.unravel_index(off.nan_to_num(torch.inf).argmax(), sums.shape))
-        raise ValueError(f"rows of {name} must be nonnegative and sum to 1; row {where} sums to {float(sums[where]):.7g}")
+    negative = ~(least >= 0)
+    if bool(negative.any()) or not bool((off <= _TOLERANCE).all()):
+        worst = negative.to(sums.dtype) if bool(negative.any()) else off.nan_to_num(torch.inf)
+        where = tuple(int(k) for k in torch.unravel_index(worst.argmax(), sums.shape))
+        found = f"has {float(least[where]):.7g}" if bool(negative[where]) else f"sums to {float(sums[where]):.7g}"
+        raise ValueError(f"rows of {name} must be nonnegative and sum to 1; row {where} {found}")
 
 
 def _off(sums: Tensor, dtype: torch.dtype) -> Tensor:

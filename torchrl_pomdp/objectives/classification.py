@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_choice, check_instance
 from torchrl_pomdp.modules.agents import AgentNetwork
-from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, without_modes
+from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, with_weights, without_modes
 
 __all__ = ["ClassificationLoss"]
 
@@ -102,7 +102,7 @@ class ClassificationLoss(LabelLoss):
         else:
             label = label_of(batch, self.tensor_keys.action, 1, floating=False)
         q_factors = label_of(batch, self.tensor_keys.q_factors, label.ndim + 1, floating=True)
-        with self.policy_params.to_module(self.policy, preserve_module_state=False):
+        with with_weights(self.policy, self.policy_params):
             logits = self.policy(y).get("logits")
         if logits.shape != q_factors.shape:
             raise ValueError(f"q_factors must have the logits' shape {tuple(logits.shape)}, got {tuple(q_factors.shape)}")

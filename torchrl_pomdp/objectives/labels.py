@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any, TypeVar, cast
 
@@ -10,13 +11,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from torchrl_pomdp.checks import shown
 from torchrl_pomdp.tensor_checks import check_entries
 
-__all__ = ["LabelLoss", "check_batch", "check_loss", "label_of", "without_modes"]
+__all__ = ["LabelLoss", "check_batch", "check_loss", "label_of", "with_weights", "without_modes"]
 
 LossClass = TypeVar("LossClass", bound="LabelLoss")
 
@@ -51,6 +52,24 @@ def without_modes(loss: type[LossClass]) -> type[LossClass]:
     """
     cast(Any, loss).forward = cast(Any, loss.forward).__wrapped__
     return loss
+
+
+@contextmanager
+def with_weights(module: nn.Module, weights: TensorDictBase) -> Iterator[None]:
+    """Lend a module other weights.
+
+    What ends the process, such as Ctrl-C, goes on as what it is: TensorDict's own way would make another error of it.
+    """
+    ending: BaseException | None = None
+    with weights.to_module(module, preserve_module_state=False):
+        try:
+            yield
+        except Exception:
+            raise
+        except BaseException as error:
+            ending = error
+    if ending is not None:
+        raise ending
 
 
 def check_batch(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> TensorDictBase:

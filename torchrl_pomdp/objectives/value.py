@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.modules import ClosedFormCost
 from torchrl_pomdp.modules.rollout import check_finite
-from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, without_modes
+from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, with_weights, without_modes
 
 __all__ = ["ValueLoss"]
 
@@ -77,7 +77,7 @@ class ValueLoss(LabelLoss):
         batch = check_batch(tensordict, self.in_keys)
         target = label_of(batch, self.tensor_keys.cost_to_go, 1, floating=True)
         check_finite("cost_to_go must be finite", target)
-        with self.value_params.to_module(self.value, preserve_module_state=False):
+        with with_weights(self.value, self.value_params):
             value = self.value(batch.select(*self.value.in_keys)).get("state_value")
         scale = self.scale.costs(batch)
         if not bool((scale >= 0).all()):

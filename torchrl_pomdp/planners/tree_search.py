@@ -157,6 +157,8 @@ class TreeSearch(TensorDictModuleBase):
             steps = map_threads(lambda i: self._decide(roots, i, found[i]), numbers, torch.get_num_threads())
             with self._lock:
                 self.simulated_steps += sum(steps)
+        if not bool((found > -np.inf).all()):
+            raise ValueError("q_factors must be finite, got nan or -inf: the model's costs overflow")
         result = torch.from_numpy(found).to(self.model.dtype)
         if bool(result.isinf().logical_xor(torch.from_numpy(found).isinf()).any()):
             largest = np.abs(found[np.isfinite(found)]).max()

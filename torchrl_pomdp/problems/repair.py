@@ -10,7 +10,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_sequence, shown
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_sequence, shown
 from torchrl_pomdp.envs.belief_model import StateGenerator
 from torchrl_pomdp.envs.generators import InPart
 from torchrl_pomdp.envs.partition import Partition, SinglePart
@@ -145,7 +145,7 @@ def _preset(
     device: torch.device,
 ) -> Problem:
     chain, costs = damage_chain(DEGRADATION), torch.tensor(COSTS)
-    if uneven:
+    if check_flag("uneven", uneven):
         # Every third location fails three times as fast, every fourth costs four times as much.
         place = torch.arange(graph.num_locations)
         fast = damage_chain([3 * rate for rate in DEGRADATION])

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import torch
 
-from torchrl_pomdp.checks import check_flag, check_label, check_mapping, shown
+from torchrl_pomdp.checks import check_flag, check_label, check_mapping, check_sequence, shown
 from torchrl_pomdp.envs.generators import FixedBelief
 from torchrl_pomdp.envs.partition import SinglePart
 from torchrl_pomdp.envs.pomdp_file import parse_pomdp
@@ -122,14 +122,35 @@ def _one_of(path: tuple[str, ...], value: Any, known: Mapping[str, Callable[...,
     kinds = [kind for kind in known if isinstance(value, Mapping) and kind in value]
     if len(kinds) != 1:
         raise SpecError(path, f"must be a table with exactly one of {', '.join(known)}, got {shown(value)}")
-    return kinds[0], {key: entry for key, entry in value.items() if key != kinds[0]}
+    options = {key: entry for key, entry in value.items() if key != kinds[0]}
+    # What follows the star of the function is what a file may say beside the kind.
+    takes = [each.name for each in inspect.signature(known[kinds[0]]).parameters.values() if each.kind is each.KEYWORD_ONLY]
+    for key in options:
+        if key not in takes:
+            raise SpecError((*path, key), f"{kinds[0]} takes no such option; allowed are {', '.join(takes) or 'none'}")
+    return kinds[0], options
 
 
-def _numbers(path: str, table: Mapping[str, Any], name: str, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+def _numbers(path: str, table: Mapping[str, Any], name: str) -> torch.Tensor:
     try:
-        return torch.tensor(table[name], dtype=dtype)
+        return torch.tensor(table[name], dtype=torch.float64)
     except (ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise SpecError((path, name), f"must be an array of numbers, got {shown(table[name])}") from error
+
+
+def _flags(path: str, table: Mapping[str, Any], name: str) -> torch.Tensor:
+    """An array of truth values; 0 and 1 are some."""
+    numbers = _numbers(path, table, name)
+    if not bool(((numbers == 0) | (numbers == 1)).all()):
+        raise SpecError((path, name), f"must be an array of truth values, got {shown(table[name])}")
+    return numbers.bool()
+
+
+def _names(path: str, table: Mapping[str, Any], name: str) -> tuple[str, ...]:
+    try:
+        return tuple(check_sequence(name, table[name], str))
+    except (ValueError, TypeError) as error:
+        raise SpecError((path, name), str(error)) from error
 
 
 def _preset(value: Any, options: Mapping[str, Any], device: torch.device) -> Problem:
@@ -179,22 +200,22 @@ def _repair(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
 def _tabular(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
     table = _table("tabular", value, _TABULAR, ("discount", "transition", "observation", "cost", "start"))
 
-    def tensor(name: str, dtype: torch.dtype = torch.float64) -> Any:
-        return _numbers("tabular", table, name, dtype) if name in table else None
+    def given(name: str, read: Callable[[str, Mapping[str, Any], str], Any] = _numbers) -> Any:
+        return read("tabular", table, name) if name in table else None
 
     def build() -> Problem:
         names = {"control_names": "controls", "observation_names": "observations", "state_names": "states"}
         model = TabularModel(
-            tensor("transition"),
-            tensor("observation"),
-            tensor("cost"),
+            given("transition"),
+            given("observation"),
+            given("cost"),
             table["discount"],
-            legal=tensor("legal", torch.bool),
-            terminal=tensor("terminal", torch.bool),
+            legal=given("legal", _flags),
+            terminal=given("terminal", _flags),
             device=device,
-            **cast(Any, {argument: tuple(table[key]) for argument, key in names.items() if key in table}),
+            **cast(Any, {argument: given(key, _names) for argument, key in names.items()}),
         )
-        start = tensor("start")
+        start = given("start")
         if start.shape != (model.num_states,):
             raise ValueError(f"start must be a distribution over {model.num_states} states, got {shown(table['start'])}")
         return Problem(model, FixedBelief(start.to(device, model.dtype)), name="tabular")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torchrl_pomdp.problems.problem import Problem
     from torchrl_pomdp.trainers.checkpoint import Checkpoint
 
-__all__ = ["RunFolder", "read_run_folder"]
+__all__ = ["RunFolder", "read_iterations", "read_run_folder"]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def read_run_folder(folder: Path, problem: Problem | None) -> RunFolder:
         raise DamagedFileError(
             f"{folder / 'config.json'} is damaged, its problem has no base policy {config['base']!r}: restore it"
         )
-    return RunFolder(config, _results(folder / "metrics.json"), _iterations(folder / "iterations.json"), policy, missing)
+    return RunFolder(config, _results(folder / "metrics.json"), read_iterations(folder / "iterations.json"), policy, missing)
 
 
 def _results(path: Path) -> list[Result]:
@@ -96,7 +96,12 @@ def _estimates(entry: Any) -> dict[str, Any]:
     return found
 
 
-def _iterations(path: Path) -> list[Mapping[str, Any]]:
+def read_iterations(path: Path) -> list[Mapping[str, Any]]:
+    """The iterations of a run as its file ``iterations.json`` tells them; none where there is no file.
+
+    Raises:
+        DamagedFileError: if the file holds anything else.
+    """
     if not path.is_file():
         return []
     try:
@@ -107,7 +112,7 @@ def _iterations(path: Path) -> list[Mapping[str, Any]]:
                 raise TypeError("an iteration has no number or no reason")
             if not all(isinstance(record["losses"], dict) for record in iteration["parts"].values()):
                 raise TypeError("a part has no losses")
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise DamagedFileError(f"{path} is damaged, it holds no iterations ({error}): restore it") from error
     return iterations
 

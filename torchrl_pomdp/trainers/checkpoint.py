@@ -54,7 +54,7 @@ class Checkpoint:
 
     Raises:
         TypeError: if something is of the wrong kind.
-        ValueError: if ``algorithm`` is no text that can be shown, or ``iteration`` is negative.
+        ValueError: if ``algorithm`` is no text that can be shown, ``iteration`` is negative, or a base policy has the name.
     """
 
     problem: Problem
@@ -71,6 +71,9 @@ class Checkpoint:
         check_integer("checkpoint.iteration", self.iteration, 0)
         check_instance("checkpoint.policy", self.policy, TensorDictModuleBase)
         check_instance("checkpoint.value", self.value, PartitionedValue)
+        own = f"{self.algorithm} {self.iteration}"
+        if self.iteration and own in self.problem.base_policies:
+            raise ValueError(f"checkpoint.problem must have no base policy named like the checkpoint, got {own!r}")
 
     @property
     def name(self) -> str:

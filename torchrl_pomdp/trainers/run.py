@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
@@ -18,11 +19,13 @@ from torchrl_pomdp.checks import check_callable, check_choice, check_flag, check
 from torchrl_pomdp.collectors import OnLabels
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
 from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
-from torchrl_pomdp.files import DamagedFileError, check_claimed, write_json
+from torchrl_pomdp.files import DamagedFileError, check_claimed, read_json, write_json
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import PartitionedValue, Policy
+from torchrl_pomdp.modules.multiagent import SCHEMES
 from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.report.run_folder import read_iterations
 from torchrl_pomdp.trainers.architecture import is_multiagent
 from torchrl_pomdp.trainers.asynchronous import AsynchronousIteration
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
@@ -34,6 +37,10 @@ __all__ = ["ALGORITHMS", "TrainingRun"]
 
 ALGORITHMS = {"pAPI-NT": papi_nt, "pAPI-T": papi_t, "API": api}
 """The algorithms that learn, by name."""
+
+_ONLINE = "|".join(["R-NT", "R-T", *(scheme.replace("_", "-") for scheme in SCHEMES)])
+# What a run calls the policies that it makes.
+_OWN_NAME = re.compile(rf"({'|'.join(ALGORITHMS)}) \d+|({_ONLINE}) of .+|.+ \+ ({_ONLINE})")
 
 Report = Callable[[str, Comparison], None]
 
@@ -94,6 +101,9 @@ class TrainingRun:
         base = self.problem.baseline if self.base is None else check_choice("base", self.base, self.problem.base_policies)
         object.__setattr__(self, "base", base)
         check_instance("config", self.config, PolicyIterationConfig)
+        for name in self.problem.base_policies:
+            if _OWN_NAME.fullmatch(name):
+                raise ValueError(f"base_policies must have names that no policy of a run has, such as 'API 1', got {name!r}")
         check_integer("states", self.states, 1, MAX_STATES)
         check_integer("rollout_states", self.rollout_states, 0, MAX_STATES)
         check_integer("online_states", self.online_states, 0, MAX_STATES)
@@ -192,7 +202,7 @@ class _Execution:
         # The first one: what the networks have been taught.
         name, online = next(iter(self._online(policy).items()))
         self._compare(f"{best} + {name}", online, run.online_states)
-        self.check_folder()
+        self._write_metrics({})
         return self.results
 
     def _online(self, policy: TensorDictModuleBase) -> dict[str, Policy]:
@@ -223,10 +233,11 @@ class _Execution:
         )
         training = together if run.staleness is None else AsynchronousIteration(together, run.staleness)
         untrained_value = PartitionedValue([self.problem.pessimistic_cost] * self.problem.partition.num_parts)
-        untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, base, untrained_value)
+        kept_best = untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, base, untrained_value)
         if not (self.folder / "best.pt").is_file():
             self._keep("best.pt", untrained)
-        summaries = []
+        # What is known already, when a run is carried out again, does not become less meanwhile.
+        summaries, known = [], self._known()
         for iteration in training:
             name = f"{run.algorithm} {iteration.number}"
             checkpoint = Checkpoint(
@@ -234,16 +245,24 @@ class _Execution:
             )
             self._keep(f"iteration-{iteration.number}.pt", checkpoint)
             if iteration.accepted:
-                self._keep("best.pt", checkpoint)
-                best = name
+                best, kept_best = name, checkpoint
+                if iteration.number > known:
+                    self._keep("best.pt", checkpoint)
             if iteration.number == 1 and together.plan[-1].truncation is not None:
                 self._compare_truncated(base, iteration.value)
             self._compare(name, iteration.policy, run.states)
             summaries.append(_summary(iteration))
-            write_json(self.folder / "iterations.json", summaries)
-        if best == run.base:
-            self._keep("best.pt", untrained)
+            if iteration.number >= known:
+                write_json(self.folder / "iterations.json", summaries)
+        self._keep("best.pt", kept_best)
         return best, training.best
+
+    def _known(self) -> int:
+        """The number of iterations that the folder tells of."""
+        try:
+            return len(read_iterations(self.folder / "iterations.json"))
+        except DamagedFileError:
+            return 0
 
     def _compare_truncated(self, base: TensorDictModuleBase, value: PartitionedValue) -> None:
         """Evaluate what the networks of the startgame have learnt from, played online, where simulations are cut."""
@@ -269,9 +288,23 @@ class _Execution:
             return
         costs = self._costs(name, policy, min(states, self.run.states))
         self.results[name] = compare(costs, self._baseline[: costs.numel()])
-        self.check_folder()
-        write_json(self.folder / "metrics.json", {key: asdict(value) for key, value in self.results.items()})
+        self._write_metrics(self._stored)
         self.report(name, self.results[name])
+
+    @cached_property
+    def _stored(self) -> dict[str, Any]:
+        """The metrics that the folder has when the run is carried out again."""
+        path = self.folder / "metrics.json"
+        try:
+            return read_json(path) if path.is_file() else {}
+        except DamagedFileError:
+            return {}
+
+    def _write_metrics(self, stored: dict[str, Any]) -> None:
+        """Bring the folder's metrics up to date, those that it has included."""
+        self.check_folder()
+        own = {key: asdict(value) for key, value in self.results.items()}
+        write_json(self.folder / "metrics.json", stored | own)
 
     def _costs(self, name: str, policy: Policy, states: int) -> Tensor:
         """Costs from the first evaluation states, computed once."""
