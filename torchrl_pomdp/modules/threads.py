@@ -9,9 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from threading import Event
 from typing import TypeVar
 
 import torch
+
+from torchrl_pomdp.stopping import check_stopped, watched, watching
 
 __all__ = ["blocks", "kept_threads", "map_threads", "rows_at_once"]
 
@@ -66,14 +69,21 @@ def map_threads(function: Callable[[_Item], _Result], items: Sequence[_Item], th
     """
     if threads == 1 or len(items) == 1:
         return [function(item) for item in items]
+    stop, above = Event(), watched()
 
     def run(item: _Item) -> _Result:
         # Gradient mode is a thread's own, like the number of threads that one operation may use.
-        with torch.no_grad():
+        with torch.no_grad(), watching(*above, stop):
+            check_stopped()
             return function(item)
 
     with kept_threads(), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        return list(pool.map(run, items))
+        try:
+            return list(pool.map(run, items))
+        except BaseException:
+            # The pool waits for those that have begun.
+            stop.set()
+            raise
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy
 from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine, local_engine, scalar_engine
 from torchrl_pomdp.modules.threads import map_threads
+from torchrl_pomdp.stopping import check_stopped
 
 __all__ = ["Budget", "TreeSearch"]
 
@@ -173,6 +174,7 @@ class TreeSearch(TensorDictModuleBase):
 
     def call(self, function: Any, *args: Any) -> Any:
         """Call a compiled loop; its arguments have the same types and memory layouts at every call."""
+        check_stopped()
         if self._loops is None:
             from torchrl_pomdp.scalar.compiling import Loops
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import json
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,6 +27,7 @@ from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue
 from torchrl_pomdp.modules.networks import LocalNetwork
+from torchrl_pomdp.stopping import Stopped, check_stopped, watching
 from torchrl_pomdp.trainers.parts import PartRecord, records_text, text_records
 from torchrl_pomdp.trainers.plan import Improve
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration, judge
@@ -34,7 +36,7 @@ __all__ = ["AsynchronousIteration", "Version"]
 
 # The record of whose folder it is, and which versions are each iteration.
 _RECORD, _MET = "asynchronous-iteration.json", "versions.json"
-# Seconds that a part which is told to stop is waited for.
+# Seconds that parts which are told to stop are waited for.
 _PATIENCE = 5.0
 
 
@@ -80,7 +82,7 @@ class _Progress:
         published: see :class:`AsynchronousIteration`.
         met: the versions that each iteration has, of all parts.
         failure: what has stopped a part.
-        stopped: whether all are to stop.
+        stop: tells all to stop.
     """
 
     networks: list[list[_Networks]]
@@ -88,7 +90,7 @@ class _Progress:
     published: list[Version] = field(default_factory=list)
     met: list[list[int]] = field(default_factory=list)
     failure: BaseException | None = None
-    stopped: bool = False
+    stop: threading.Event = field(default_factory=threading.Event)
 
     def versions(self) -> list[int]:
         """The last version of each part."""
@@ -196,10 +198,11 @@ class AsynchronousIteration:
                 yield Iteration(number, policy, value, accepted, reason, comparison, records)
         finally:
             with self._changed:
-                state.stopped = True
+                state.stop.set()
                 self._changed.notify_all()
+            until = time.monotonic() + _PATIENCE
             for thread in threads:
-                thread.join(_PATIENCE)
+                thread.join(max(0.0, until - time.monotonic()))
 
     def _meet(self, number: int, state: _Progress) -> list[int]:
         """The versions that are an iteration, once all parts have come that far."""
@@ -211,7 +214,7 @@ class AsynchronousIteration:
 
     def _may_begin(self, number: int, state: _Progress) -> bool:
         """Whether a part may begin to make a version, or is to stop."""
-        return state.stopped or number - 1 - min(state.versions()) <= self.staleness
+        return state.stop.is_set() or number - 1 - min(state.versions()) <= self.staleness
 
     # ---- a part ------------------------------------------------------------------------------------------------------
 
@@ -223,10 +226,11 @@ class AsynchronousIteration:
                     self._changed.wait_for(partial(self._may_begin, number, state))
                     used = state.versions()
                     freshest, state.labels[part] = [own[-1] for own in state.networks], _Labels(number)
-                networks = None if state.stopped else self._version(part, number, freshest, state)
+                with watching(state.stop):
+                    networks = self._version(part, number, freshest, state)
                 with self._changed:
                     # Who was told to stop meanwhile leaves the folder to others.
-                    if networks is None or state.stopped:
+                    if state.stop.is_set():
                         return
                     version = Version(part, number, tuple(used))
                     self._keep(version, networks)
@@ -235,13 +239,16 @@ class AsynchronousIteration:
                     if state.meet():
                         self._note(state)
                     self._changed.notify_all()
+        except Stopped:
+            return
         except BaseException as error:
             with self._changed:
                 state.failure = error
                 self._changed.notify_all()
 
-    def _version(self, part: int, number: int, freshest: list[_Networks], state: _Progress) -> _Networks | None:
-        """Networks that a part learns from the freshest of all parts; None if it has been stopped."""
+    def _version(self, part: int, number: int, freshest: list[_Networks], state: _Progress) -> _Networks:
+        """Networks that a part learns from the freshest of all parts."""
+        check_stopped()
         run, records = self.run, {}
         local, values = [own.policy for own in freshest], [own.value for own in freshest]
         if number > 1:
@@ -257,16 +264,14 @@ class AsynchronousIteration:
             # A copy, encoder and all: a training takes modules apart that other parts read.
             training = run._training(index, part, copy.deepcopy(network), number)
             for block in collector.blocks(run.workers, run._images.counts):
-                if state.stopped:
-                    return None
+                check_stopped()
                 state.labels[part].blocks.append((index, block))
                 if block.summary[part]:
                     training.add(part, block.handle)
             for other, block in state.images(part, number, index):
                 training.add(other, block.handle)
             with self._trainers:
-                if state.stopped:
-                    return None
+                check_stopped()
                 trained = run.workers.trained({part: training})[part]
             network.load_state_dict(trained.weights)
             (local if isinstance(step, Improve) else values)[part] = network.eval()

@@ -27,6 +27,7 @@ from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.threads import kept_threads
 from torchrl_pomdp.problems.problem import Symmetry
 from torchrl_pomdp.progress import progress_bar
+from torchrl_pomdp.stopping import check_stopped
 
 __all__ = ["MEMORY", "PartData", "PartImages", "PartJob", "PartRecord", "Trained", "train_part"]
 
@@ -344,6 +345,7 @@ class _Stepper(DefaultOptimizationStepper):
         self._sums: dict[str, float] = {}
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
+        check_stopped()
         if self.count == 0:
             self.bar = progress_bar(self.steps, "step", f"train {self.name}", self.progress)
         # The trainer averages them over all steps; with their graphs it would keep every step's memory.
