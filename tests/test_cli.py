@@ -17,8 +17,10 @@ from torchrl_pomdp.cli import main
 from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.envs.repair import trajectory_figure
 from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
+from torchrl_pomdp.modules import PartitionedValue
 from torchrl_pomdp.modules.repair import GreedyRepair
-from torchrl_pomdp.trainers import load_checkpoint
+from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.trainers import Checkpoint, PolicyIterationConfig, load_checkpoint, save_checkpoint
 
 TINY = (
     "--iterations 1 --samples-per-part 30 --trajectories 1 --epochs 1 --least-steps 1 --batch-size 30 --max-steps 30 "
@@ -135,6 +137,7 @@ def test_evaluate_by_name_and_online(policy, capsys):
         ("evaluate FILE", "is damaged or no"),
         ("evaluate greedy --problem nosuch", "problem must be a preset"),
         ("evaluate greedy --states 0", "states must be"),
+        ("train line3 --base=", "base must be one of"),
         ("evaluate greedy --trajectories 0", "trajectories must be"),
         ("evaluate greedy --seed -1", "seed must be"),
         ("evaluate greedy --device nonsense", "device must be"),
@@ -168,6 +171,28 @@ def test_errors_while_it_runs_are_one_line(error, tmp_path, monkeypatch, capsys)
     assert main(["train", "line3", *TINY.split(), "--out", str(tmp_path / "run")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f"torchrl-pomdp: {' '.join(str(error).split())}"
+
+
+def test_ctrl_c_is_one_line(monkeypatch, capsys):
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "train", interrupt)
+    assert main(["train", "line3"]) == 130
+    assert capsys.readouterr().err.split("\n") == ["", "torchrl-pomdp: interrupted; the same command goes on", ""]
+
+
+@pytest.mark.parametrize("content", ["", "[1]", '[{"parts": {"a": {}}}]', "[" * 100_000])
+def test_damaged_iterations_are_named(content, tmp_path, capsys):
+    """Where a comparison reads how long PPO shall be trained."""
+    problem = make_problem("line3")
+    value = PartitionedValue([problem.pessimistic_cost] * problem.partition.num_parts)
+    best = Checkpoint(problem, PolicyIterationConfig(), "API", 0, problem.base_policies["greedy"], value)
+    save_checkpoint(tmp_path / "best.pt", best)
+    (tmp_path / "iterations.json").write_text(content)
+    assert main(["compare", "line3", "--checkpoint", str(tmp_path / "best.pt"), "--methods", "urgency"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{tmp_path / 'iterations.json'} is damaged" in line
 
 
 def test_help_imports_nothing_heavy():

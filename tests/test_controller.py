@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_pomdp.controller import Controller, Decision
+from torchrl_pomdp.envs import SinglePart
 from torchrl_pomdp.envs.repair import RepairModel, damage_chain, line
 from torchrl_pomdp.modules import Myopic, RolloutPolicy
 from torchrl_pomdp.modules.repair import GreedyRepair
@@ -125,6 +126,24 @@ def text(controller):
     return controller.to_json()
 
 
+def worse_pipes():
+    """A controller of a model that is described in the same words: pipes that fail twice as fast."""
+    model = two_robots()
+    other = RepairModel(model.graph, model.chain @ model.chain, model.costs, model.discount, num_robots=2, dtype=model.dtype)
+    assert other.describe() == model.describe()
+    controller = Controller(other, Myopic(other))
+    controller.reset(prior())
+    return controller
+
+
+def test_a_state_is_taken_over_where_the_partition_is_another():
+    first, model = Controller(two_robots(), Myopic(two_robots())), two_robots().with_partition(SinglePart())
+    first.reset(prior())
+    second = Controller(model, Myopic(model))
+    second.load_json(first.to_json())
+    assert all(torch.equal(second.state[key], first.state[key]) for key in model.state_keys)
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
@@ -155,6 +174,7 @@ def text(controller):
         (lambda c: c.load_json("no JSON"), ValueError, "text must be what to_json gave"),
         (lambda c: c.load_json(text(c).replace("line of 4", "line of 5")), ValueError, "text must be what to_json gave"),
         (lambda c: c.load_json(text(c).replace("0.5", "0.9", 1)), ValueError, "sum to 1"),
+        (lambda c: c.load_json(text(worse_pipes())), ValueError, "text must be what to_json gave for the model"),
     ],
 )
 def test_what_is_refused_changes_nothing(call, error, message):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 
+import numpy as np
 import pytest
 import torch
 
-from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, tensor_bytes
+from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, save_tensors, tensor_bytes
 
 
 def test_an_archive_before_or_behind_another_one_is_refused(tmp_path):
@@ -17,6 +18,13 @@ def test_an_archive_before_or_behind_another_one_is_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(DamagedFileError, match=str(path)):
             load_tensors(path)
+
+
+@pytest.mark.parametrize("value", [np.float64(3), np.int64(3), (1, 2)])
+def test_what_cannot_be_read_back_is_not_written(tmp_path, value):
+    with pytest.raises(TypeError, match="must be a tensor, a number, a text or a dictionary of them"):
+        save_tensors(tmp_path / "a.pt", {"x": {"y": value}})
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_record_is_claimed_by_one_of_many(tmp_path):

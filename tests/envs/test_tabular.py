@@ -12,6 +12,8 @@ from torchrl_pomdp.envs import FixedBelief, TabularModel
 from torchrl_pomdp.modules import Myopic, TruncatedRollout
 from torchrl_pomdp.problems import tiger
 
+NEGATIVE = torch.tensor([[[1.0, 0.0], [2.0, -1.0]]])
+
 
 def distributions(generator, *shape, share=0.7):
     """Rows with zeros among their numbers."""
@@ -279,6 +281,9 @@ def test_names():
 def test_bad_arrays_are_named():
     eye, half = torch.eye(2).unsqueeze(0), torch.full((1, 2, 2), 0.5)
     cost = torch.zeros(1, 2)
+    for rows in (NEGATIVE, NEGATIVE.to_sparse()):
+        with pytest.raises(ValueError, match=r"rows of transition must .* row \(0, 1\) has -1"):
+            TabularModel(rows, torch.ones(1, 2, 1), torch.zeros(1, 2), 0.9)
     with pytest.raises(ValueError, match=r"rows of transition must .* row \(0, 1\) sums to 2"):
         TabularModel(torch.tensor([[[1.0, 0.0], [1.0, 1.0]]]), half, cost, 0.9)
     with pytest.raises(ValueError, match=r"rows of transition must .* row \(0, 1\) sums to 2"):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+import time
 import warnings
 
 import pytest
@@ -28,6 +30,7 @@ from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.problems import tiger
+from torchrl_pomdp.stopping import check_stopped
 
 
 def chain_model(size, drift=0.0, dtype=torch.float32):
@@ -57,6 +60,24 @@ def test_the_number_of_threads_changes_nothing(linear20):
     finally:
         torch.set_num_threads(before)
     assert torch.equal(one, three)
+
+
+def test_what_fails_in_one_thread_stops_the_others():
+    """As Ctrl-C does, which reaches the main thread alone: searches look again and again whether to go on."""
+    both = threading.Barrier(2)
+
+    def work(number):
+        both.wait(60)
+        if number == 0:
+            raise KeyboardInterrupt
+        for _ in range(60_000):
+            check_stopped()
+            time.sleep(0.001)
+        pytest.fail("was not stopped")
+
+    with pytest.raises(KeyboardInterrupt):
+        map_threads(work, [0, 1], threads=2)
+    check_stopped()
 
 
 def test_map_threads_passes_errors_on():

@@ -211,3 +211,19 @@ def test_losses_leave_the_modes_of_the_process_alone(line3, labelled):
         with set_exploration_type(ExplorationType.RANDOM):
             loss(labelled[:5])
         assert seen[1] == (ExplorationType.RANDOM, recurrent_mode())
+
+
+def test_ctrl_c_in_a_loss_is_ctrl_c(line3, labelled):
+    """TensorDict's way of lending weights would make another error of it; the module has its own weights afterwards."""
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    policy = PolicyNetwork(FlatEncoder(line3.model), line3.model.num_controls, (8,), generator=generator())
+    for loss in ClassificationLoss(policy), ValueLoss(value_network(line3.model), NeverRepairCost(line3.model)):
+        expected = loss(labelled[:5])
+        hook = loss.network.register_forward_hook(interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            loss(labelled[:5])
+        hook.remove()
+        assert (loss(labelled[:5]) == expected).all()

@@ -287,6 +287,14 @@ def test_costs_that_overflow_are_refused(make):
         make(model, None)(y)
 
 
+def test_costs_that_overflow_double_precision_are_refused():
+    half, cost = torch.full((2, 2, 2), 0.5).double(), torch.tensor([[1e308, 1e308], [-1e308, -1e308]], dtype=torch.float64)
+    model = TabularModel(half, half, cost, 0.99, dtype=torch.float64)
+    y = TensorDict({"belief": torch.tensor([[0.5, 0.5]], dtype=torch.float64)}, [1])
+    with pytest.raises(ValueError, match="q_factors must be finite, got nan or -inf"):
+        POMCP(model, None, simulations=200)(y)
+
+
 def test_any_seed_will_do(make, line3):
     for problem in (line3, make_problem("tiger")):
         y = problem.start(torch.arange(1))

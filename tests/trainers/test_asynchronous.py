@@ -16,7 +16,7 @@ from torchrl_pomdp.collectors.labels import Block
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.problems import make_problem
-from torchrl_pomdp.trainers import AsynchronousIteration, PolicyIterationConfig, asynchronous, papi_nt, papi_t
+from torchrl_pomdp.trainers import AsynchronousIteration, PolicyIterationConfig, asynchronous, papi_nt, papi_t, parts
 from torchrl_pomdp.trainers.run import TrainingRun
 from torchrl_pomdp.workers import LocalWorkers
 
@@ -189,6 +189,24 @@ def test_what_stops_a_part_stops_all(line3, monkeypatch):
     monkeypatch.setattr(run.run, "_collector", broken)
     with pytest.raises(ArithmeticError, match="no idea"):
         list(run)
+
+
+def test_parts_that_are_stopped_stop_in_the_middle_of_their_training(line3, monkeypatch):
+    """Nobody waits for a million steps."""
+    run = asynchronously(line3, config=replace(CONFIG, least_steps=1_000_000))
+    before = set(threading.enumerate())
+    stepping = threading.Event()
+    step = parts._Stepper.step
+    monkeypatch.setattr(parts._Stepper, "step", lambda *args: (stepping.set(), step(*args))[1])
+
+    def interrupted():
+        assert stepping.wait(60)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "_meet", lambda *_: interrupted())
+    with pytest.raises(KeyboardInterrupt):
+        list(run)
+    assert set(threading.enumerate()) <= before
 
 
 def test_who_looks_no_further_stops_the_parts(line3):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchrl_pomdp import cli
+from torchrl_pomdp import cli, commands
 from torchrl_pomdp.evaluation import compare
 from torchrl_pomdp.modules import PartitionedValue
 from torchrl_pomdp.modules.repair import GreedyRepair
@@ -119,10 +119,23 @@ def test_what_does_not_belong_is_refused(folder, line3, checkpoint, linear20, tm
     assert not list(tmp_path.iterdir())
 
 
+def write_iterations(folder, *steps):
+    numbers = {"samples": 1, "label_seconds": 1.0, "train_seconds": 1.0, "losses": {}}
+    parts = {str(part): {"simulated_steps": made, **numbers} for part, made in enumerate(steps)}
+    (folder / "iterations.json").write_text(json.dumps([{"number": 1, "reason": "better", "parts": parts}]))
+
+
+def test_ppo_takes_as_many_steps_as_the_labels_did_but_no_fewer_than_it_can(tmp_path):
+    assert commands._simulated_steps(tmp_path) is None
+    write_iterations(tmp_path, 3000, 4000)
+    assert commands._simulated_steps(tmp_path) == 7000
+    write_iterations(tmp_path, 3, 4)
+    assert commands._simulated_steps(tmp_path) == 4096
+
+
 def test_the_command_writes_table_and_pictures(line3, checkpoint, tmp_path, capsys, monkeypatch):
     save_checkpoint(tmp_path / "best.pt", checkpoint)
-    parts = {"a": {"simulated_steps": 40}, "b": {"simulated_steps": 2}}
-    (tmp_path / "iterations.json").write_text(json.dumps([{"parts": parts}]))
+    write_iterations(tmp_path, 40_000, 2_000)
     given = []
 
     def few(problem, folder, **options):
@@ -135,7 +148,7 @@ def test_the_command_writes_table_and_pictures(line3, checkpoint, tmp_path, caps
     command = ["compare", "line3", "--checkpoint", str(tmp_path / "best.pt"), "--states", "3", "--seconds", "0.001"]
     assert cli.main([*command, "--runs", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]) == 0
     (options,) = given
-    assert options["ppo_steps"] == 42
+    assert options["ppo_steps"] == 42_000
     assert problem_digest(options["checkpoint"].problem) == problem_digest(line3)
     name = "compare-line3-0.001s"
     assert {file.name for file in (tmp_path / "out" / "compare").iterdir()} == {

@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -14,8 +17,9 @@ from torchrl_pomdp import kept as kept_results
 from torchrl_pomdp.files import load_tensors, save_tensors
 from torchrl_pomdp.modules.repair import UrgencyRepair
 from torchrl_pomdp.problems import make_problem
-from torchrl_pomdp.trainers import PolicyIterationConfig, load_checkpoint, parts
+from torchrl_pomdp.trainers import Checkpoint, PolicyIterationConfig, load_checkpoint, parts, policy_iteration
 from torchrl_pomdp.trainers import run as module
+from torchrl_pomdp.trainers.architecture import make_networks, make_values
 from torchrl_pomdp.trainers.checkpoint import open_run_folder
 from torchrl_pomdp.trainers.run import TrainingRun
 
@@ -264,8 +268,48 @@ def test_what_is_refused_leaves_nothing_behind(tmp_path, options, message):
     assert not list(tmp_path.iterdir())
 
 
+def test_what_is_finished_stays_so_while_a_run_is_carried_out_again(tmp_path, monkeypatch):
+    """Whenever that is interrupted: the best policy and the table are not those of an earlier time."""
+    run = replace(RUN, base="greedy", config=replace(TINY, iterations=2))
+    monkeypatch.setattr(policy_iteration, "judge", lambda comparison: (True, "accepted"))
+    run.carry_out(tmp_path / "run")
+    names = ("best.pt", "metrics.json", "iterations.json")
+    before = [(tmp_path / "run" / name).read_bytes() for name in names]
+    assert load_checkpoint(tmp_path / "run/best.pt").name == "API 2"
+    for stop in ("greedy", "API 1"):
+
+        def killed(name, comparison, stop=stop):
+            if name == stop:
+                raise Killed
+
+        with pytest.raises(Killed):
+            run.carry_out(tmp_path / "run", report=killed)
+        assert [(tmp_path / "run" / name).read_bytes() for name in names] == before
+    run.carry_out(tmp_path / "run")
+    assert [(tmp_path / "run" / name).read_bytes() for name in names] == before
+
+
+@pytest.mark.parametrize("name", ["API 1", "pAPI-NT 3", "R-NT of greedy", "greedy + R-NT", "one-at-a-time of greedy"])
+def test_base_policies_are_not_named_like_what_a_run_makes(line3, name):
+    problem = replace(line3, base_policies={**line3.base_policies, name: line3.base_policies["urgency"]}, spec=None)
+    with pytest.raises(ValueError, match="base_policies must have names that no policy of a run has"):
+        TrainingRun(problem)
+
+
+def test_a_checkpoint_is_not_named_like_a_base_policy(line3):
+    problem = replace(line3, base_policies={**line3.base_policies, "mine 1": line3.base_policies["urgency"]}, spec=None)
+    policy, value = (make(problem, TINY, seed=0) for make in (make_networks, make_values))
+    with pytest.raises(ValueError, match="no base policy named like the checkpoint, got 'mine 1'"):
+        Checkpoint(problem, TINY, "mine", 1, policy, value)
+
+
 def test_a_kill_while_a_run_folder_is_opened_does_not_spoil_it(tmp_path):
-    (tmp_path / ".config.123.json").write_text("{")
+    program = (
+        "import os, signal, sys\nfrom torchrl_pomdp.trainers.checkpoint import open_run_folder\n"
+        "os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\nopen_run_folder(sys.argv[1], {'seed': 0})"
+    )
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False).returncode == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 1
     assert open_run_folder(str(tmp_path), {"seed": 0}) == tmp_path
     with pytest.raises(ValueError, match="differs in seed"):
         open_run_folder(tmp_path, {"seed": 1})
