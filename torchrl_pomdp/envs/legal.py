@@ -8,12 +8,16 @@ A batched environment (``SerialEnv``, ``ParallelEnv``) has the spec of an enviro
 live in other processes; there is no hook through which they could tell it a mask. Importing this module therefore extends four
 functions of TorchRL: the two that draw show the ``"action_mask"`` of the TensorDict at hand to the spec before they draw, and
 ``set_seed`` of the two batched environments seeds the spec. Nothing changes for any other spec.
+
+Specs are sent to other processes with their random generator. PyTorch sends a generator's state by a file that the other
+process cannot open; here it is told to send plain bytes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import wraps
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import torch
@@ -36,20 +40,6 @@ class _Current:
     def __init__(self, generator: torch.Generator | None) -> None:
         self.generator = generator
         self.mask: Tensor | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """With the generator as plain bytes: another process cannot open a generator that is sent to it."""
-        generator = self.generator
-        content = None if generator is None else (str(generator.device), generator.get_state().numpy().tobytes())
-        return {"mask": self.mask, "generator": content}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """The inverse of :meth:`__getstate__`."""
-        self.mask, self.generator = state["mask"], None
-        if state["generator"] is not None:
-            device, content = state["generator"]
-            self.generator = torch.Generator(device)
-            self.generator.set_state(torch.frombuffer(bytearray(content), dtype=torch.uint8))
 
     def source(self, device: torch.device) -> torch.Generator:
         """Where random numbers come from; if nobody gave a generator, from a new one, seeded by the operating system."""
@@ -281,6 +271,17 @@ def _extend(owner: type, name: str, extend: Callable[[Callable[..., Any]], Calla
     setattr(owner, name, extended)
 
 
+def _generator_of(device: str, state: bytes) -> torch.Generator:
+    generator = torch.Generator(device)
+    generator.set_state(torch.frombuffer(bytearray(state), dtype=torch.uint8))
+    return generator
+
+
+def _sent(generator: torch.Generator) -> tuple[Any, ...]:
+    return _generator_of, (str(generator.device), generator.get_state().numpy().tobytes())
+
+
+ForkingPickler.register(torch.Generator, _sent)
 _extend(EnvBase, "rand_action", lambda draw: _looking(draw, lambda env: env.input_spec["full_action_spec"]))
 _extend(RandomPolicy, "__call__", lambda draw: _looking(draw, lambda policy: policy.action_spec))
 _extend(SerialEnv, "set_seed", _seeding)
