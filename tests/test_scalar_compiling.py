@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from torchrl_pomdp import noise
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.scalar import compiling, scalar_twin
 from torchrl_pomdp.scalar.compiling import code_digest, entry, inner, outer
-from torchrl_pomdp.scalar.noise import finished, fold, hash_numbers, scenario_noise, uniform
+from torchrl_pomdp.scalar.noise import finished, fold, hash_numbers, hash_words, scenario_noise, uniform
 
 KEYS = noise.seed_keys(5, torch.arange(200))
 
@@ -56,6 +57,19 @@ def test_fingerprints_are_those_of_tensors(dtype, bits):
     belief, out = torch.rand(7, 5, generator=torch.Generator().manual_seed(0), dtype=dtype), np.empty(7, np.uint64)
     hashed(belief.numpy().view(bits), out)
     assert torch.equal(torch.from_numpy(out.view(np.int64)), noise.fingerprint(TensorDict({"belief": belief}, [7])))
+
+
+@pytest.mark.parametrize("width", [3, 8, 16, 64])
+def test_rows_that_change_places_change_the_hash_of_a_layer(width):
+    layer = np.eye(8, width, dtype=np.float32)
+    orders = [list(range(8))]
+    for a, b in itertools.combinations(range(8), 2):
+        order = list(range(8))
+        order[a], order[b] = b, a
+        orders.append(order)
+    layers = {layer[order].tobytes() for order in orders}
+    hashes = {int(hash_words((layer[order].reshape(-1).view(np.uint32),))) for order in orders}
+    assert len(hashes) == len(layers)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -153,7 +153,8 @@ class LabelCollector(Collector):
         Raises:
             RuntimeError: by TorchRL, if there are no weights to take.
         """
-        if policy_or_weights is None and not _SOURCES & kwargs.keys() and self._given is not None:
+        given = any(kwargs.get(source) is not None for source in _SOURCES)
+        if policy_or_weights is None and not given and self._given is not None:
             policy_or_weights = self._given()
         if isinstance(policy_or_weights, nn.Module):
             policy_or_weights = TensorDict.from_module(policy_or_weights)

@@ -18,6 +18,7 @@ from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.modules.truncation import Truncation
+from torchrl_pomdp.stopping import check_stopped
 from torchrl_pomdp.tensor_checks import check_keys, place
 
 __all__ = ["MAX_STEPS", "MAX_TRAJECTORIES", "Policy", "TerminalCost", "TruncatedRollout", "terminal_costs"]
@@ -284,6 +285,7 @@ class TruncatedRollout(nn.Module):
         live = self._admit(y, scenarios, 0, waiting, total)
         self._check_policy(live.y)
         while live.number.numel():
+            check_stopped()
             ended = int(live.ended.sum())
             if ended <= _RENEW_FRACTION * live.ended.numel():
                 live = self._checked_step(live, count, total)

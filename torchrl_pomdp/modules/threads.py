@@ -68,14 +68,13 @@ def map_threads(function: Callable[[_Item], _Result], items: Sequence[_Item], th
         [1, 4, 9]
     """
     if threads == 1 or len(items) == 1:
-        return [function(item) for item in items]
+        return [_unless_stopped(function, item) for item in items]
     stop, above = Event(), watched()
 
     def run(item: _Item) -> _Result:
         # Gradient mode is a thread's own, like the number of threads that one operation may use.
         with torch.no_grad(), watching(*above, stop):
-            check_stopped()
-            return function(item)
+            return _unless_stopped(function, item)
 
     with kept_threads(), ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         try:
@@ -84,6 +83,11 @@ def map_threads(function: Callable[[_Item], _Result], items: Sequence[_Item], th
             # The pool waits for those that have begun.
             stop.set()
             raise
+
+
+def _unless_stopped(function: Callable[[_Item], _Result], item: _Item) -> _Result:
+    check_stopped()
+    return function(item)
 
 
 @contextmanager

@@ -19,7 +19,7 @@ _GOLDEN, _FIRST, _SECOND = np.uint64(GOLDEN), np.uint64(0xBF58476D1CE4E5B9), np.
 _FACTOR, _STEP, _STEPS = np.uint64(FACTOR), np.uint64(STEP), np.uint64(STEPS)
 CONTROLS = np.uint64(0x636F6E74)
 """Folded into a key, it sets the numbers of random controls apart from those of observations."""
-_ONE, _WORD, _ROUNDS, _BITS = np.uint64(1), np.uint64(0xFFFFFFFF), ROUNDS, BITS
+_ONE, _HALF, _WORD, _ROUNDS, _BITS = np.uint64(1), np.uint64(16), np.uint64(0xFFFFFFFF), ROUNDS, BITS
 _UNIT, _LARGEST = np.float32(2.0**-24), np.float32(LARGEST)
 
 
@@ -127,7 +127,8 @@ def hash_words(arrays):
     for words in arrays:
         total = _mix(total)
         for i in range(len(words)):
-            total += np.uint64(words[i]) * ((np.uint64(i) * _GOLDEN & _WORD) | _ONE)
+            place = np.uint64(i) * _GOLDEN & _WORD
+            total += np.uint64(words[i]) * (((place ^ (place >> _HALF)) * _SECOND & _WORD) | _ONE)
     return total
 
 

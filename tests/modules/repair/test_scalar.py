@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 import tracemalloc
 
@@ -428,6 +429,31 @@ def test_networks_that_are_trained_further_are_read_again(linear20, written):
     after = cost(y, keys)
     assert not torch.equal(before, after)
     assert_close(after, without(lambda: TruncatedRollout(model, policy))(y, keys))
+
+
+def test_weights_that_were_good_before_are_read_again(line3):
+    """After some that are no numbers; and where rows change places, or a layer lies in memory in another way meanwhile."""
+    model, y = line3.model, line3.start(torch.arange(16))
+    network = PolicyNetwork(FlatEncoder(model), 3, (16, 16), generator=torch.Generator().manual_seed(0))
+    policy = RolloutPolicy(model, network, trajectories=5)
+    first, good = policy.q_factors(y), copy.deepcopy(network.state_dict())
+
+    def anew():
+        return RolloutPolicy(model, network, trajectories=5).q_factors(y)
+
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.mul_(-3.0)
+        network.network[0].weight[0, 0] = math.nan
+    with pytest.raises(ValueError, match="logits of a network must be finite"):
+        policy.q_factors(y)
+    network.load_state_dict(good)
+    assert torch.equal(policy.q_factors(y), first)
+    square = network.network[2].weight
+    usual = square.data
+    for content in (usual.T, usual, torch.eye(16), torch.eye(16).flip(0), torch.eye(16)[[0, 2, 1, *range(3, 16)]]):
+        square.data = content
+        assert torch.equal(policy.q_factors(y), anew())
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

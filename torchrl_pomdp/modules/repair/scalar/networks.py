@@ -106,11 +106,14 @@ class _Weights:
         """
         now = [p for each in self.layers for layer in each for p in (layer.weight, layer.bias)]
         where = [p.data_ptr() for p in now]
-        if where != self._where or not all(p.is_contiguous() for p in now):
-            self._where, self._memory = where, tuple(p.detach().numpy().reshape(-1).view(np.uint32) for p in now)
+        whole = all(p.is_contiguous() for p in now)
+        if where != self._where or not whole:
+            self._where = where if whole else []
+            self._memory = tuple(np.ascontiguousarray(p.detach().numpy()).reshape(-1).view(np.uint32) for p in now)
         content = self._loops(hash_words, self._memory)
         if content == self._copied:
             return
+        self._copied = None
         for each, weight, bias in zip(self.layers, self.weights, self.biases, strict=True):
             for number, layer in enumerate(each):
                 weight[number] = layer.weight.detach().T.numpy()
