@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -125,10 +125,15 @@ def _one_of(path: tuple[str, ...], value: Any, known: Mapping[str, Callable[...,
     options = {key: entry for key, entry in value.items() if key != kinds[0]}
     # What follows the star of the function is what a file may say beside the kind.
     takes = [each.name for each in inspect.signature(known[kinds[0]]).parameters.values() if each.kind is each.KEYWORD_ONLY]
+    _check_options(path, kinds[0], options, takes)
+    return kinds[0], options
+
+
+def _check_options(path: tuple[str, ...], kind: str, options: Mapping[str, Any], takes: Sequence[str]) -> None:
+    """Raise if a kind is given an option that it does not take."""
     for key in options:
         if key not in takes:
-            raise SpecError((*path, key), f"{kinds[0]} takes no such option; allowed are {', '.join(takes) or 'none'}")
-    return kinds[0], options
+            raise SpecError((*path, key), f"{kind} takes no such option; allowed are {', '.join(takes) or 'none'}")
 
 
 def _numbers(path: str, table: Mapping[str, Any], name: str) -> torch.Tensor:
@@ -147,10 +152,7 @@ def _flags(path: str, table: Mapping[str, Any], name: str) -> torch.Tensor:
 
 
 def _names(path: str, table: Mapping[str, Any], name: str) -> tuple[str, ...]:
-    try:
-        return tuple(check_sequence(name, table[name], str))
-    except (ValueError, TypeError) as error:
-        raise SpecError((path, name), str(error)) from error
+    return tuple(_checked((path, name), "", lambda: check_sequence(name, table[name], str)))
 
 
 def _preset(value: Any, options: Mapping[str, Any], device: torch.device) -> Problem:
@@ -158,9 +160,7 @@ def _preset(value: Any, options: Mapping[str, Any], device: torch.device) -> Pro
         raise SpecError(("preset",), f"must be one of {', '.join(sorted(PRESETS))}, got {shown(value)}")
     # Of what the function takes, what a file can say.
     takes = [key for key in inspect.signature(PRESETS[value]).parameters if key not in ("graph", "start", "name", "device")]
-    for key in options:
-        if key not in takes:
-            raise SpecError((key,), f"{value} takes no such option; allowed are {', '.join(takes) or 'none'}")
+    _check_options((), value, options, takes)
     try:
         return make_problem(value, device=device, **options)
     except (ValueError, TypeError) as error:

@@ -178,8 +178,7 @@ class Training:
         self.done = 0
         self.policy = cast(PolicyNetwork, make_networks(problem, config, seed).policies[0])
         # Not the weights of the policy network.
-        other = _apart(seed)
-        self.value = cast(ValueNetwork, make_values(problem, config, other, self.policy.encoder).values[0])
+        self.value = cast(ValueNetwork, make_values(problem, config, _apart(seed), self.policy.encoder).values[0])
         for network in (self.policy, self.value):
             _shrink(network)
         self.actor = self.policy.actor()
