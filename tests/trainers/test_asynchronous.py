@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 import time
 from dataclasses import replace
@@ -13,10 +14,20 @@ import torch
 
 from torchrl_pomdp.collectors import StateMemory
 from torchrl_pomdp.collectors.labels import Block
+from torchrl_pomdp.config import EVALUATION_SEED
+from torchrl_pomdp.evaluation import discounted_costs
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.problems import make_problem
-from torchrl_pomdp.trainers import AsynchronousIteration, PolicyIterationConfig, asynchronous, papi_nt, papi_t, parts
+from torchrl_pomdp.trainers import (
+    AsynchronousIteration,
+    PolicyIterationConfig,
+    asynchronous,
+    load_checkpoint,
+    papi_nt,
+    papi_t,
+    parts,
+)
 from torchrl_pomdp.trainers.run import TrainingRun
 from torchrl_pomdp.workers import LocalWorkers
 
@@ -226,6 +237,22 @@ def test_a_training_run(line3, tmp_path):
     assert run.carry_out(tmp_path / "run") == first
     with pytest.raises(ValueError, match="staleness"):
         replace(run, staleness=None).carry_out(tmp_path / "run")
+
+
+def test_costs_are_those_of_the_networks_that_met_last(line3, tmp_path):
+    """What is made again has the old name, but is another policy."""
+    run, folder = TrainingRun(line3, config=CONFIG, states=20, online_states=10, staleness=1), tmp_path / "run"
+    run.carry_out(folder)
+    name = "pAPI-NT 2"
+    first, costs = load_checkpoint(folder / "iteration-2.pt", problem=line3), run.costs(folder, [name])[name]
+    shutil.copy(folder / "part-2/version-1.pt", folder / "part-2/version-2.pt")
+    run.carry_out(folder)
+    second = load_checkpoint(folder / "iteration-2.pt", problem=line3)
+    assert weights(first.policy) != weights(second.policy)
+    again = run.costs(folder, [name])[name]
+    options = {"num_states": 20, "seed": EVALUATION_SEED, "terminal_cost": line3.evaluation_cost}
+    assert torch.equal(again, discounted_costs(line3.model, second.policy, line3.start, **options))
+    assert not torch.equal(again, costs)
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -307,10 +307,11 @@ class _Execution:
         write_json(self.folder / "metrics.json", stored | own)
 
     def _costs(self, name: str, policy: Policy, states: int) -> Tensor:
-        """Costs from the first evaluation states, computed once."""
+        """Costs from the first evaluation states, computed once for each policy of a name."""
         path, owner = _costs_file(self.folder, name), _owner(self.identity, name)
-        content = kept(path, owner)
-        if content is not None:
+        # A name does not say which networks it stands for: in an asynchronous run that depends on time.
+        own, content = digest(policy), kept(path, owner)
+        if content is not None and content.get("policy") == own:
             return content["costs"]
         costs = discounted_costs(
             self.problem.model,
@@ -324,7 +325,7 @@ class _Execution:
             workers=self.workers,
         ).cpu()
         self.check_folder()
-        keep(path, owner, {"costs": costs})
+        keep(path, owner, {"policy": own, "costs": costs})
         return costs
 
 
