@@ -14,7 +14,7 @@ from torchrl_pomdp.checks import check_callable, check_flag, check_instance, che
 from torchrl_pomdp.envs.belief_model import INSIGNIFICANT, BeliefModel
 from torchrl_pomdp.envs.rows import put_rows, take_rows
 from torchrl_pomdp.modules.compiling import compiled
-from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, scalar_engine
+from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, makeup, scalar_engine
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.modules.truncation import Truncation
@@ -35,7 +35,7 @@ _CHUNK_ROWS = 16_000
 # Longest simulation and most trajectories of an estimate: there are tables of the one, and numbers of 24 bits for the other.
 MAX_STEPS, MAX_TRAJECTORIES = 1_000_000, 1 << 24
 # What a copy does not take along, nor a file.
-_OWN = {"_lock", "_members", "_transition", "scalar", "simulated_steps"}
+_OWN = {"_lock", "_makeup", "_transition", "scalar", "simulated_steps"}
 # States at which the first controls of a policy are checked.
 _CHECKED = 256
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
@@ -209,14 +209,11 @@ class TruncatedRollout(nn.Module):
         limits = Limited(self.max_steps, self.truncation, self.terminal_cost)
         engine = scalar_engine(self.base_policy, self.model, limits)
         self.scalar = engine if isinstance(engine, ScalarEngine) else None
-        self._members = self._policy_members()
-
-    def _policy_members(self) -> tuple[nn.Module, ...]:
-        return tuple(self.base_policy.modules()) if isinstance(self.base_policy, nn.Module) else ()
+        self._makeup = makeup(self.base_policy)
 
     def engine(self) -> ScalarEngine | None:
-        """The compiled loop, made anew where modules of the base policy, such as local networks, have been replaced."""
-        if self.scalar is not None and self._policy_members() != self._members:
+        """The compiled loop, made anew where modules of the base policy, such as local networks, were replaced or got hooks."""
+        if makeup(self.base_policy) != self._makeup:
             self._make_engine()
         return self.scalar
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.scenarios import Scenarios
@@ -211,12 +211,26 @@ def scalar_engine(policy: Any, model: BeliefModel, limits: Limited) -> SearchEng
     return engine
 
 
+def makeup(policy: Any) -> tuple[tuple[nn.Module, ...], tuple[bool, ...]]:
+    """What compiled simulations of a policy are made of: once it differs, they are to be made anew.
+
+    Args:
+        policy: the policy.
+
+    Returns:
+        its modules, none for what is no module; and, if any has hooks or a ``forward`` of its own, of which twins know
+        nothing, which ones.
+    """
+    members = tuple(policy.modules()) if isinstance(policy, nn.Module) else ()
+    altered = tuple(bool(m._forward_hooks or m._forward_pre_hooks or "forward" in vars(m)) for m in members)
+    return members, altered if any(altered) else ()
+
+
 def _has_twin(policy: Any) -> bool:
     """Whether a policy offers compiled simulations of what it does, and not of what a class does that it overrides."""
-    hooks = getattr(policy, "_forward_hooks", None) or getattr(policy, "_forward_pre_hooks", None)
     for kind in type(policy).__mro__:
         if "scalar_engine" in vars(kind):
-            return not hooks
+            return not makeup(policy)[1]
         if "forward" in vars(kind) or "__call__" in vars(kind):
             return False
     return False

@@ -19,14 +19,14 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy
-from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine, local_engine, scalar_engine
+from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine, local_engine, makeup, scalar_engine
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.stopping import check_stopped
 
 __all__ = ["Budget", "TreeSearch"]
 
 # What a copy does not take along, nor a file.
-_OWN = {"_lock", "_loops", "engine", "simulated_steps"}
+_OWN = {"_lock", "_loops", "_makeup", "engine", "simulated_steps"}
 # Most simulations of a decision.
 _MOST = 10**9
 
@@ -119,8 +119,12 @@ class TreeSearch(TensorDictModuleBase):
     def _prepare(self) -> None:
         """What a copy makes for itself."""
         self.simulated_steps = 0
-        self._lock, self.engine = Lock(), self._engine()
+        self._lock = Lock()
         self._loops: Any = None
+        self._prepare_engine()
+
+    def _prepare_engine(self) -> None:
+        self.engine, self._makeup = self._engine(), makeup(self.base_policy)
 
     def _engine(self) -> SearchEngine:
         if find_spec("numba") is None:
@@ -151,6 +155,8 @@ class TreeSearch(TensorDictModuleBase):
     def _search(self, y: TensorDictBase) -> Tensor:
         """What the searches from states ``[*B]`` have found, ``[*B, U + E]``."""
         self.model.check_state(y)
+        if makeup(self.base_policy) != self._makeup:
+            self._prepare_engine()
         roots = self.engine.roots(y, self.seed)
         found = np.full((y.batch_size.numel(), self.model.num_controls + self._extra), np.inf)
         numbers = range(len(found))

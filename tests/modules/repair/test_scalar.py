@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
+from torch.nn import functional as F
 
 from benchmarks.setting import by_tensors
 from torchrl_pomdp.envs import FunctionPartition, SinglePart
@@ -48,6 +49,7 @@ from torchrl_pomdp.modules.repair import (
 from torchrl_pomdp.modules.repair.scalar import expected_cost, repair_engine
 from torchrl_pomdp.modules.scalar import Allocation
 from torchrl_pomdp.noise import seed_keys
+from torchrl_pomdp.planners import POMCP
 from torchrl_pomdp.scalar import scalar_twin
 
 COSTS = (0, 0.1, 1, 10, 100)
@@ -479,6 +481,37 @@ def test_a_local_network_that_is_replaced_is_another_policy(linear20):
     assert not torch.equal(cost(y, keys), before[0])
     assert not torch.equal(q.q_factors(y), before[1])
     assert_close(cost(y, keys), without(lambda: TruncatedRollout(model, policy))(y, keys))
+
+
+def test_hooks_and_replaced_forwards_are_left_to_tensors(linear20):
+    """Of a network's layers, too, and whenever they come and go."""
+    model, y, keys = linear20.model, linear20.start(torch.arange(8)), torch.arange(8)
+    policy = networks(model)
+    cost, search = TruncatedRollout(model, policy), POMCP(model, policy, simulations=5)
+    before = cost(y, keys)
+    search(y)
+    reverse = [local.network[-1].register_forward_hook(lambda module, given, logits: -logits) for local in policy.policies]
+    changed = cost(y, keys)
+    assert cost.engine() is None
+    assert not torch.equal(changed, before)
+    assert_close(changed, without(lambda: TruncatedRollout(model, policy))(y, keys))
+    assert TruncatedRollout(model, policy).engine() is None
+    with pytest.raises(ValueError, match="base_policy must have a scalar twin"):
+        search(y)
+    for hook in reverse:
+        hook.remove()
+    assert torch.equal(cost(y, keys), before)
+    search(y)
+    layer = policy.policies[0].network[0]
+    layer.forward = lambda x: -F.linear(x, layer.weight, layer.bias)
+    assert cost.engine() is None
+    assert not torch.equal(cost(y, keys), before)
+    del layer.forward
+    torch.nn.utils.weight_norm(layer)
+    assert cost.engine() is None
+    with torch.no_grad():
+        layer.weight_g.mul_(-1.0)
+    assert not torch.equal(cost(y, keys), before)
 
 
 def test_what_the_loop_does_not_know_is_left_to_tensors(linear20):
