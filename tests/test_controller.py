@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from itertools import product
 
 import pytest
@@ -261,6 +262,20 @@ def test_a_state_in_a_file_gives_the_same_decisions(dtype):
 
 
 @pytest.mark.parametrize("online", [False, True])
+def test_a_model_that_no_text_can_tell_is_named():
+    class Locked(RepairModel):
+        def __init__(self, *args):
+            super().__init__(*args)
+            self.lock = threading.Lock()
+
+    model = Locked(line(4), CHAIN, (0.0, 1.0, 10.0), 0.9)
+    control = Controller(model, GreedyRepair(model))
+    control.reset(prior((0,)).to(torch.float32).set("location", torch.tensor([0])))
+    for call in (control.to_json, lambda: control.load_json("{}")):
+        with pytest.raises(TypeError, match=r"what a _thread\.lock holds cannot be told"):
+            call()
+
+
 def test_a_checkpoint_becomes_a_controller(tmp_path, online):
     from torchrl_pomdp.config import PolicyIterationConfig
     from torchrl_pomdp.trainers.architecture import make_networks, make_values

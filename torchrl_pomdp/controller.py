@@ -186,6 +186,9 @@ class Controller:
     def to_json(self) -> str:
         """The present state as a JSON text, to the last bit; the policy is not in it.
 
+        Raises:
+            TypeError: if the model holds what a text cannot tell, such as a lock or an open file.
+
         Examples:
             >>> from torchrl_pomdp.modules import Myopic
             >>> from torchrl_pomdp.problems import tiger
@@ -205,13 +208,14 @@ class Controller:
         """Go on from a state that :meth:`to_json` gave.
 
         Raises:
-            TypeError: if it is no text.
+            TypeError: if it is no text, or the model holds what no text can tell.
             ValueError: if it is no such text, or of another model.
         """
         check_instance("text", text, str)
+        own = self._of_model
         try:
             given = check_mapping("text", json.loads(text), object)
-            if given["format"] != _FORMAT or any(given[key] != own for key, own in self._of_model.items()):
+            if given["format"] != _FORMAT or any(given[key] != value for key, value in own.items()):
                 raise ValueError(f"it is {shown(given['format'])} of {shown(given['model'])}, {shown(given['digest'])}")
             steps = check_integer("steps", given["steps"], 0)
             entries = check_mapping("state", given["state"], (list, int, float))
@@ -219,7 +223,7 @@ class Controller:
             core = {key: _tensor(key, entries[key], spec[key].dtype) for key in self.model.state_keys}
             state = self._single("state", TensorDict(core, batch_size=()))
         except (TypeError, ValueError, KeyError, RuntimeError, OverflowError) as error:
-            described = ", ".join(self._of_model.values())
+            described = ", ".join(own.values())
             raise ValueError(f"text must be what to_json gave for the model {described}: {error}") from error
         self._state, self._steps = state, steps
 

@@ -146,7 +146,9 @@ class _Walk:
         try:
             reduced = value.__reduce_ex__(4)
         except TypeError as error:
-            raise TypeError(f"what a {_name(kind)} holds cannot be told, so no run with it can be kept: {error}") from error
+            raise TypeError(
+                f"what a {_name(kind)} holds cannot be told, so no file can say that it belongs to it: {error}"
+            ) from error
         if isinstance(reduced, str):
             return _hash("named", reduced)
         make, given, state, *items = (*reduced, None)[:5]
