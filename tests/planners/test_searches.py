@@ -287,6 +287,17 @@ def test_costs_that_overflow_are_refused(make):
         make(model, None)(y)
 
 
+@pytest.mark.parametrize("size", [1e307, 1e308])
+def test_costs_that_all_overflow_double_precision_are_refused(make, size):
+    half = torch.full((2, 2, 2), 0.5).double()
+    model = TabularModel(half, half, torch.full((2, 2), size, dtype=torch.float64), 0.95, dtype=torch.float64)
+    y = TensorDict({"belief": torch.tensor([[0.5, 0.5]], dtype=torch.float64)}, [1])
+    with pytest.raises(ValueError, match=r"must be finite, got .*: the model's costs overflow"):
+        make(model, Myopic(model))(y)
+    with pytest.raises(ValueError, match="model must have smaller costs"):
+        solve(model, torch.tensor([0.5, 0.5]))
+
+
 def test_costs_that_overflow_double_precision_are_refused():
     half, cost = torch.full((2, 2, 2), 0.5).double(), torch.tensor([[1e308, 1e308], [-1e308, -1e308]], dtype=torch.float64)
     model = TabularModel(half, half, cost, 0.99, dtype=torch.float64)

@@ -138,6 +138,8 @@ class DESPOT(TreeSearch):
                     return made
 
         steps += grow(OVER)
+        if not math.isfinite(tree.upper[0]):
+            raise ValueError(f"bounds must be finite, got {tree.upper[0]}: the model's costs overflow")
         for _ in chain.from_iterable(map(range, self.budget.stretches())):
             if tree.upper[0] - tree.lower[0] <= _CLOSED * abs(tree.upper[0]) and not tree.open[0]:
                 break

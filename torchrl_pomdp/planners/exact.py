@@ -2,6 +2,7 @@ r"""Certified bounds of the optimal cost of small problems, by point-based value
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from time import monotonic
 from typing import NamedTuple
@@ -191,7 +192,7 @@ def solve(
     Raises:
         TypeError: if an argument is of the wrong kind.
         ValueError: if ``belief`` is no distribution over the states, if it leads to a belief whose states share no legal
-            control, or a number is out of range.
+            control, if the model's costs add up to more than a number can hold, or a number is out of range.
 
     Examples:
         >>> from torchrl_pomdp.problems import tiger
@@ -208,7 +209,12 @@ def solve(
     begin = monotonic()
     until = begin + check_number("seconds", seconds, "(0, inf)")
     check_flag("progress", progress)
-    search = Search(JointTable(model))
+    table = JointTable(model)
+    largest = max(-table.lowest, table.highest)
+    # Bounds are added up and subtracted.
+    if not math.isfinite(4.0 * largest / (1.0 - table.discount)):
+        raise ValueError(f"model must have smaller costs, got a discounted sum of up to {largest:g}: it overflows")
+    search = Search(table)
     roots = [search.start(row) for row in beliefs]
     with progress_bar(None, "trial", "solve", progress) as bar:
         while _mean(roots).relative_gap > relative_gap and monotonic() < until:

@@ -146,9 +146,11 @@ class TreeSearch(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``, and ``"q_factors"``, ``[*B, U]``, infinite where a control was not tried."""
         q = self._search(tensordict)[..., : self.model.num_controls]
+        nothing, terminal = torch.isinf(q).all(-1), self.model.is_terminal(tensordict)
+        if bool((nothing & ~terminal).any()):
+            raise ValueError("q_factors must be finite, got inf for every control: the model's costs overflow")
         # Where nothing follows, whatever is legal is as good.
-        nothing = torch.isinf(q).all(-1, keepdim=True) & self.model.action_mask(tensordict)
-        q = q.masked_fill(nothing, 0.0)
+        q = q.masked_fill(terminal.unsqueeze(-1) & self.model.action_mask(tensordict), 0.0)
         return tensordict.set("q_factors", q).set("action", q.argmin(-1))
 
     @torch.no_grad()
