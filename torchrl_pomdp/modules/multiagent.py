@@ -6,7 +6,7 @@ iteration with application to autonomous sequential repair problems", Section II
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_callable, check_choice, check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import flat_rows
+from torchrl_pomdp.modules.own import MakesItsOwn
 from torchrl_pomdp.modules.qfactors import SimulatedQFactors, cheapest
 from torchrl_pomdp.modules.rollout import Policy, TerminalCost, controls_of
 from torchrl_pomdp.modules.truncation import Truncation
@@ -26,7 +27,7 @@ SCHEMES: tuple[Scheme, ...] = get_args(Scheme)
 """The schemes by name."""
 
 
-class MultiagentRollout(SimulatedQFactors):
+class MultiagentRollout(MakesItsOwn, SimulatedQFactors):
     r"""Rollout policies for many agents, such as robots; each minimises Q-factors over its own controls alone.
 
     The Q-factor of agent r's control :math:`u_r` is that of the joint control in which the other agents do what the scheme
@@ -82,6 +83,8 @@ class MultiagentRollout(SimulatedQFactors):
         (torch.Size([4, 2, 3]), torch.Size([4]))
     """
 
+    _OWN = frozenset({"evaluated"})
+
     def __init__(
         self,
         model: BeliefModel,
@@ -120,15 +123,9 @@ class MultiagentRollout(SimulatedQFactors):
             if scheme != "autonomous":
                 raise ValueError(f"signalling is for scheme='autonomous', got it for {scheme!r}")
         self.signalling = signalling
-        self.evaluated = 0
+        self._prepare()
 
-    def __getstate__(self) -> dict[str, Any]:
-        """All but the count: a copy starts its own."""
-        return {key: value for key, value in self.__dict__.items() if key != "evaluated"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """The inverse of :meth:`__getstate__`."""
-        super().__setstate__(state)
+    def _prepare(self) -> None:
         self.evaluated = 0
 
     @torch.no_grad()

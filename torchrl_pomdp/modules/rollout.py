@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from threading import Lock
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, shown
 from torchrl_pomdp.envs.belief_model import INSIGNIFICANT, BeliefModel
 from torchrl_pomdp.envs.rows import put_rows, take_rows
 from torchrl_pomdp.modules.compiling import compiled
+from torchrl_pomdp.modules.own import MakesItsOwn
 from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, makeup, scalar_engine
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import rows_at_once
@@ -34,8 +35,6 @@ them as ``"state_value"`` ``[*B]`` (costs, lower is better). ``in_keys``, where 
 _CHUNK_ROWS = 16_000
 # Longest simulation and most trajectories of an estimate: there are tables of the one, and numbers of 24 bits for the other.
 MAX_STEPS, MAX_TRAJECTORIES = 1_000_000, 1 << 24
-# What a copy does not take along, nor a file.
-_OWN = {"_lock", "_makeup", "_transition", "scalar", "simulated_steps"}
 # States at which the first controls of a policy are checked.
 _CHECKED = 256
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
@@ -107,7 +106,7 @@ class _Live(NamedTuple):
         return _Live(put_rows(self.y, index, other.y), self.scenarios.replace_rows(index, other.scenarios), *rest)
 
 
-class TruncatedRollout(nn.Module):
+class TruncatedRollout(MakesItsOwn):
     r"""Discounted cost of following a base policy from given feature states, one trajectory each.
 
     :math:`\sum_{k<m}\alpha^k\hat g(y_k,\mu(y_k))+\alpha^m\hat J(y_m)`; a trajectory that reaches a terminal state ends
@@ -165,6 +164,8 @@ class TruncatedRollout(nn.Module):
         True
     """
 
+    _OWN = frozenset({"_lock", "_makeup", "_transition", "scalar", "simulated_steps"})
+
     _discounts: Tensor
 
     def __init__(
@@ -198,7 +199,6 @@ class TruncatedRollout(nn.Module):
         self._prepare()
 
     def _prepare(self) -> None:
-        """What a copy does not take along, nor a file."""
         self.simulated_steps = 0
         # Several threads may share a rollout.
         self._lock = Lock()
@@ -216,15 +216,6 @@ class TruncatedRollout(nn.Module):
         if makeup(self.base_policy) != self._makeup:
             self._make_engine()
         return self.scalar
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but the lock, the compiled loop and the count: a copy starts its own."""
-        return {key: value for key, value in self.__dict__.items() if key not in _OWN}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """The inverse of :meth:`__getstate__`."""
-        super().__setstate__(state)
-        self._prepare()
 
     def forward(self, y: TensorDictBase, keys: Tensor | Scenarios, count: int = 1) -> Tensor:
         """Cost of one trajectory from every row.

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.modules.own import MakesItsOwn
 from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy
 from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine, local_engine, makeup, scalar_engine
 from torchrl_pomdp.modules.threads import map_threads
@@ -25,8 +26,6 @@ from torchrl_pomdp.stopping import check_stopped
 
 __all__ = ["Budget", "TreeSearch"]
 
-# What a copy does not take along, nor a file.
-_OWN = {"_lock", "_loops", "_makeup", "engine", "simulated_steps"}
 # Most simulations of a decision.
 _MOST = 10**9
 
@@ -73,7 +72,7 @@ class Budget:
             size = max(1, int(min(fitting, 4.0 * done)))
 
 
-class TreeSearch(TensorDictModuleBase):
+class TreeSearch(MakesItsOwn, TensorDictModuleBase):
     """Base of the searches: feature states ``[*B]`` in, ``"action"`` and ``"q_factors"`` out, like ``RolloutPolicy``.
 
     Args:
@@ -93,6 +92,7 @@ class TreeSearch(TensorDictModuleBase):
     """
 
     out_keys = ["action", "q_factors"]
+    _OWN = frozenset({"_lock", "_loops", "_makeup", "engine", "simulated_steps"})
     # Numbers that a search finds beside the Q-factors.
     _extra = 0
 
@@ -117,7 +117,6 @@ class TreeSearch(TensorDictModuleBase):
         self._prepare()
 
     def _prepare(self) -> None:
-        """What a copy makes for itself."""
         self.simulated_steps = 0
         self._lock = Lock()
         self._loops: Any = None
@@ -193,15 +192,6 @@ class TreeSearch(TensorDictModuleBase):
         """Raise unless all was well with the base policy's controls."""
         if not well:
             raise ValueError("base_policy chose an illegal control in a simulation; its scalar twin must choose a legal one")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but the lock, the compiled loops and the count: a copy starts its own."""
-        return {key: value for key, value in self.__dict__.items() if key not in _OWN}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """The inverse of :meth:`__getstate__`."""
-        super().__setstate__(state)
-        self._prepare()
 
 
 def grown(array: NDArray[Any]) -> NDArray[Any]:
