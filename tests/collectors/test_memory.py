@@ -64,6 +64,14 @@ def test_the_order_of_visits_does_not_matter(linear20):
     assert all(held(whole, part) == held(parts, part) for part in range(6) if whole.count(part) or parts.count(part))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_states_that_are_often_visited_are_kept(line3, seed):
+    """Each visit may retain its state; a state that nobody else visits has a single chance."""
+    everything, tenth = (visit(line3.unpartitioned(), torch.arange(300), retain=share, seed=seed) for share in (1.0, 0.1))
+    start = set(everything.model.fingerprint(line3.start(torch.arange(300))).tolist())
+    assert start <= held(tenth, 0) <= held(everything, 0)
+
+
 def test_exploration_leaves_the_policys_trajectories(linear20):
     model, greedy = linear20.model, GreedyRepair(linear20.model)
     memories = [StateMemory(model, retain=1.0) for _ in range(2)]

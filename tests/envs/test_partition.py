@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from torchrl_pomdp.collectors import PartSampler
-from torchrl_pomdp.envs import InPart, Mixture, SinglePart
-from torchrl_pomdp.envs.repair import CalibratedStart, RandomState, RepairPartition, grid, line
+from torchrl_pomdp.envs import FixedBelief, InPart, Mixture, RandomPlay, SinglePart, TabularModel
+from torchrl_pomdp.envs.repair import CalibratedStart, RandomState, RepairPartition, UniformStart, grid, line
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 
 
@@ -115,6 +115,34 @@ def test_a_mixture_within_a_mixture_keeps_its_shares(linear20):
     assert abs(known.float().mean() - 0.5) < 4 * (0.25 / 8000) ** 0.5
     shares = linear20.model.partition(y[~known]).bincount(minlength=6) / int((~known).sum())
     assert (shares - torch.tensor([1.0, 1.0, 2.0, 1.0, 1.0, 2.0]) / 8).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9])
+@pytest.mark.parametrize("wrap", ["function", "part", "play", "play of play"])
+def test_a_choice_does_not_follow_from_that_of_a_mixture_around_it(linear20, share, wrap):
+    model = linear20.model
+    inner, around = Mixture([UniformStart(model, (3,)), UniformStart(model, (10,))], [0.5, 0.5]), UniformStart(model, (17,))
+    single = model.with_partition(SinglePart())
+    wrapped = {
+        "function": lambda keys: inner(keys),
+        "part": InPart(single, inner, 0),
+        "play": RandomPlay(model, inner, 0),
+        "play of play": RandomPlay(model, RandomPlay(model, inner, 0), 0),
+    }[wrap]
+    y = Mixture([around, wrapped], [share, 1.0 - share])(torch.arange(8000))
+    counts = y["location"].flatten().bincount(minlength=20)
+    assert int(counts[[3, 10, 17]].sum()) == 8000
+    for place, expected in ((3, 0.5 * (1 - share)), (10, 0.5 * (1 - share)), (17, share)):
+        assert abs(counts[place] / 8000 - expected) <= 4 * (expected * (1 - expected) / 8000) ** 0.5
+
+
+def test_random_play_from_random_play_goes_on_by_itself():
+    """A stage or none, and again a stage or none, each as likely as the other."""
+    forward = torch.eye(3).roll(1, 1)[None]
+    model = TabularModel(forward, torch.eye(3)[None], torch.ones(1, 3), 0.9)
+    play = RandomPlay(model, RandomPlay(model, FixedBelief(torch.eye(3)[0]), 1), 1)
+    shares = play(torch.arange(8000))["belief"].mean(0)
+    assert (shares - torch.tensor([0.25, 0.5, 0.25])).abs().max() < 0.02
 
 
 def test_bad_arguments_are_refused(linear20):

@@ -22,9 +22,10 @@ from torchrl_pomdp.envs.repair import (
     grid,
     line,
 )
-from torchrl_pomdp.modules import AfterSteps, OnEntering, OnLeaving
-from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
+from torchrl_pomdp.modules import AfterSteps, ConstantCost, OnEntering, OnLeaving
+from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder, UrgencyRepair
 from torchrl_pomdp.problems import Problem, make_problem
+from torchrl_pomdp.problems.problem import identity_symmetry
 from torchrl_pomdp.trainers import Evaluate, Improve, PolicyIteration, PolicyIterationConfig
 from torchrl_pomdp.trainers import policy_iteration as module
 
@@ -113,6 +114,10 @@ OTHERS = {
     "start of a function": ({"mine": lambda: problem(start=lambda model: lambda keys: RandomState(model)(keys))}, "start"),
     "training": ({"mine": lambda: problem(fractions=(0.5, 1.0))}, "training"),
     "training's kind": ({"mine": lambda: _mixed(problem())}, "training"),
+    "symmetries": ({"mine": lambda: replace(problem(), symmetries=(identity_symmetry, lambda y: y))}, "symmetries"),
+    "pessimistic cost": ({"mine": lambda: replace(problem(), pessimistic_cost=ConstantCost(problem().model, 9.0))},
+                         "pessimistic_cost"),
+    "encoder": ({"mine": lambda: replace(problem(), encoder=RelativeEncoder)}, "encoder"),
     "base policy": ({"base": UrgencyRepair}, "base_policy"),
     "base policy's threshold": ({"base": lambda model: GreedyRepair(model, 0.3)}, "base_policy"),
     "seed": ({"config": replace(CONFIG, seed=1)}, "config"),

@@ -23,7 +23,7 @@ from torchrl_pomdp.workers import LOCAL, Workers
 __all__ = ["StateMemory"]
 
 # What a key's independent streams are for.
-_START, _STEPS, _EXPLORE, _CONTROL, _PICK = range(16, 21)
+_START, _STEPS, _EXPLORE, _CONTROL, _PICK, _RETAIN = range(16, 22)
 # Trajectories that are followed at once on a CPU.
 _BLOCK = 8192
 
@@ -31,13 +31,14 @@ _BLOCK = 8192
 class StateMemory:
     """A random sample of the states that policies have visited, bounded in every part.
 
-    A state is retained with probability ``retain``; of more than ``capacity`` retained states of a part a random subset is
-    kept. What is kept is a function of the seed and of the states alone, not of the order in which they came.
+    Each visit retains its state with probability ``retain``, once however often it is retained: a state that is often
+    visited is hardly ever missing. Of more than ``capacity`` retained states of a part a random subset is kept. What is kept
+    is a function of the seed and of the visits alone, not of their order.
 
     Args:
         model: the belief model; without a partition all states are in part 0.
         capacity: largest number of states of a part.
-        retain: probability that a visited state is retained, in (0, 1]; the paper's is about 0.1.
+        retain: probability that a visit retains its state, in (0, 1]; the paper's is about 0.1.
         seed: seed of the sample.
 
     Raises:
@@ -130,8 +131,8 @@ class StateMemory:
         states = kept[0]
 
         def draw(keys: Tensor) -> TensorDictBase:
-            flat = fold(keys.reshape(-1), _PICK)
-            index = (uniform(flat, 0).double() * states.batch_size[0]).to(torch.int64)
+            # Whole hashes: a uniform of 24 bits would not reach all of many states.
+            index = fold(keys.reshape(-1), _PICK).remainder(states.batch_size[0])
             return take_rows(states, index).view(keys.shape)
 
         return draw
@@ -180,15 +181,15 @@ def visits(shared: tuple[Any, ...], keys: Tensor) -> tuple[TensorDictBase | None
     model, policy, start, exploration, max_steps, retention = shared
     with torch.no_grad():
         steps = _walk(model, policy, start, exploration, max_steps, keys)
-        found: list[Any] = [_retained(model, y, *retention) for y in steps]
+        found: list[Any] = [_retained(model, y, visit, *retention) for y, visit in steps]
     states = torch.cat(found, 0) if found else None
     return states, 0 if states is None else len(states)
 
 
 def _walk(
     model: BeliefModel, policy: Policy, start: StateGenerator, exploration: float, max_steps: int, keys: Tensor
-) -> Iterator[TensorDictBase]:
-    """The states of every step of the trajectories with the given keys."""
+) -> Iterator[tuple[TensorDictBase, Tensor]]:
+    """The states of every step of the trajectories with the given keys, and a key of each visit."""
     y = model.derive(model.drawn(start, fold(keys, _START), "start"))
     scenarios = Scenarios.single(fold(keys, _STEPS))
     for step in range(max_steps):
@@ -197,7 +198,7 @@ def _walk(
             y, keys, scenarios = take_rows(y, rest), keys[rest], scenarios.rows(rest)
         if keys.numel() == 0:
             return
-        yield y
+        yield y, fold(fold(keys, _RETAIN), step)
         u = controls_of("policy", policy, y.copy())
         model.check_controls(y, u)
         random = random_control(y.get("action_mask"), _uniforms(model, keys, _CONTROL, step))
@@ -214,10 +215,10 @@ def _uniforms(model: BeliefModel, keys: Tensor, purpose: int, step: int) -> Tens
     return uniform(fold(fold(keys, purpose), step).unsqueeze(-1), agents)
 
 
-def _retained(model: BeliefModel, y: TensorDictBase, retain: float, seed: int) -> TensorDictBase:
-    """The rows of ``y`` that are retained, with their priority and part."""
+def _retained(model: BeliefModel, y: TensorDictBase, visit: Tensor, retain: float, seed: int) -> TensorDictBase:
+    """The rows of ``y`` that their visits retain, with their priority and part."""
     entries = y.select(*model.state_keys)
     priority = fold(model.fingerprint(entries), seed)
     part = y.get("partition") if model.partition is not None else torch.zeros_like(priority)
-    rows = (uniform(priority, 0) < retain).nonzero().squeeze(-1)
+    rows = (uniform(fold(visit, seed), 0) < retain).nonzero().squeeze(-1)
     return take_rows(entries, rows).update({"priority": priority[rows], "part": part[rows]})

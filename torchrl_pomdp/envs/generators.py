@@ -22,7 +22,7 @@ from torchrl_pomdp.tensor_checks import check_distributions, check_keys, check_t
 __all__ = ["FixedBelief", "InPart", "Mixture", "RandomPlay", "draw_each"]
 
 # What a key's independent streams of uniforms are for, beside those of the generators that are drawn from.
-_RETRY, _CHOICE, _LENGTH, _PLAY = range(6, 10)
+_RETRY, _CHOICE, _LENGTH, _PLAY, _INNER = range(6, 11)
 # Probability that random play keeps a control for another stage.
 _KEPT = 0.75
 # Candidates that a rejection round makes at once.
@@ -93,8 +93,7 @@ class Mixture:
     """Generator that draws each state from one of several generators.
 
     Args:
-        generators: the generators that are mixed; a mixture among them is replaced by what it mixes, so that there is one
-            choice for each state.
+        generators: the generators that are mixed, mixtures among them, too.
         weights: their probabilities, nonnegative with positive sum.
 
     Raises:
@@ -114,26 +113,18 @@ class Mixture:
             raise ValueError("generators is empty: a mixture needs at least one")
         for i, generator in enumerate(generators):
             check_callable(f"generators[{i}]", generator)
-        shares_given = check_tensor("weights", weights, (len(generators),)).to(torch.float32)
-        if not bool((shares_given >= 0).all()) or not 0 < float(shares_given.sum()) < torch.inf:
+        shares = check_tensor("weights", weights, (len(generators),)).to(torch.float32)
+        if not bool((shares >= 0).all()) or not 0 < float(shares.sum()) < torch.inf:
             raise ValueError(f"weights must be {len(generators)} nonnegative numbers with positive sum, got {shown(weights)}")
-        self.generators: list[StateGenerator] = []
-        shares: list[Tensor] = []
-        for generator, weight in zip(generators, shares_given, strict=True):
-            if isinstance(generator, Mixture):
-                self.generators += generator.generators
-                shares.append(weight * generator.weights / generator.weights.sum())
-            else:
-                self.generators.append(generator)
-                shares.append(weight.unsqueeze(0))
-        self.weights: Tensor = torch.cat(shares)
+        self.generators, self.weights = list(generators), shares
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` for int64 keys ``[*B]``."""
         flat = check_keys("keys", keys).reshape(-1)
         probs = self.weights.to(keys.device).expand(flat.numel(), -1)
         which = inverse_cdf(probs, uniform(fold(flat, _CHOICE), 0))
-        return draw_each(self.generators, which, flat).view(keys.shape)
+        # By other keys: what is drawn may be a mixture again, and its choice is another one.
+        return draw_each(self.generators, which, fold(flat, _INNER)).view(keys.shape)
 
 
 class RandomPlay:
@@ -166,7 +157,7 @@ class RandomPlay:
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""
         model, flat = self.model, check_keys("keys", keys).reshape(-1)
-        y = model.drawn(self.start, flat, "start").select(*model.state_keys)
+        y = model.drawn(self.start, fold(flat, _INNER), "start").select(*model.state_keys)
         length = (uniform(fold(flat, _LENGTH), 0) * (self.max_stages + 1)).to(torch.int64)
         u = torch.full((*flat.shape, *model.control_shape), -1, device=flat.device)
         numbers = torch.arange(model.noise_dim + 1 + math.prod(model.control_shape), device=flat.device)

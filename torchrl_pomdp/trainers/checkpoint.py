@@ -118,8 +118,8 @@ def problem_digest(problem: Problem) -> str:
         >>> problem_digest(make_problem("line3")) == problem_digest(make_problem("line3", partitioned=False))
         False
     """
-    content = (problem.model, problem.start, problem.training, problem.pessimistic_cost, problem.symmetries, problem.encoder)
-    return digest(content)
+    encoders = problem.encoder, problem.agent_encoder
+    return digest((problem.model, problem.start, problem.training, problem.pessimistic_cost, problem.symmetries, *encoders))
 
 
 def save_checkpoint(path: str | PathLike[str], checkpoint: Checkpoint) -> None:
