@@ -8,7 +8,10 @@ import os
 import subprocess
 import sys
 import threading
+import types
 from collections import deque
+from fractions import Fraction
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -33,9 +36,38 @@ def other_default(y, n=2):
     return y + n
 
 
+class Place(NamedTuple):
+    number: int
+
+
 def network(seed, hidden=(4, 3)):
     model = make_problem("line3").model
     return PolicyNetwork(RelativeEncoder(model), 3, hidden, generator=torch.Generator().manual_seed(seed))
+
+
+def kind(**entries):
+    """A class of a user."""
+    return type("Kind", (), {"__module__": __name__, **entries})
+
+
+def cached(n):
+    return functools.cache(adds(n))
+
+
+def calls(n):
+    """A function that reads a compiled or cached helper of its module."""
+    source = {"__name__": __name__, "helper": cached(n)}
+    exec("def function(y):\n    return helper(y)", source)
+    return source["function"]
+
+
+def asks(n):
+    """A function that calls one of another module."""
+    helpers = types.ModuleType("helpers")
+    helpers.decide = adds(n)
+    source = {"__name__": __name__, "helpers": helpers}
+    exec("def function(y):\n    return helpers.decide(y)", source)
+    return source["function"]
 
 
 # Pairs of makers of what is equal to itself and differs from the other one.
@@ -72,6 +104,27 @@ PAIRS = {
     "weights": (lambda: network(0), lambda: network(1)),
     "layers": (lambda: network(0), lambda: network(0, (4,))),
     "methods": (lambda: network(0).forward, lambda: network(1).forward),
+    "class attributes": (lambda: kind(n=1), lambda: kind(n=2)),
+    "class of sets": (lambda: kind(n={1}), lambda: kind(n={2})),
+    "class of fractions": (lambda: kind(n=Fraction(1, 3)), lambda: kind(n=Fraction(2, 3))),
+    "class of objects": (lambda: kind(n=kind(m=1)()), lambda: kind(n=kind(m=2)())),
+    "class of classes": (lambda: kind(n=kind(m=1)), lambda: kind(n=kind(m=2))),
+    "class methods": (lambda: kind(f=adds(1)), lambda: kind(f=adds(2))),
+    "properties": (lambda: kind(f=property(adds(1))), lambda: kind(f=property(adds(2)))),
+    "static methods": (lambda: kind(f=staticmethod(adds(1))), lambda: kind(f=staticmethod(adds(2)))),
+    "cached properties": (
+        lambda: kind(f=functools.cached_property(adds(1))),
+        lambda: kind(f=functools.cached_property(adds(2))),
+    ),
+    "cached methods": (lambda: kind(f=cached(1)), lambda: kind(f=cached(2))),
+    "partial methods": (
+        lambda: kind(f=functools.partialmethod(default, n=1)),
+        lambda: kind(f=functools.partialmethod(default, n=2)),
+    ),
+    "objects of a class": (lambda: kind(n=1)(), lambda: kind(n=2)()),
+    "cached helpers": (lambda: calls(1), lambda: calls(2)),
+    "helpers of a module": (lambda: asks(1), lambda: asks(2)),
+    "named tuples": (lambda: Place(1), lambda: Place(2)),
 }
 
 

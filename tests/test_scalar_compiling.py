@@ -6,6 +6,9 @@ import itertools
 import logging
 import subprocess
 import sys
+import threading
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -96,6 +99,73 @@ def test_a_digest_tells_code_constants_and_what_is_called_apart():
     digests = {code_digest(make(number, other)) for number, other in [(1, 1), (2, 1), (1, 2)]}
     assert len(digests) == 3
     assert code_digest(make(1, 1)) == code_digest(make(1, 1))
+
+
+def closure(value):
+    return lambda x: x + value
+
+
+def default(value):
+    def function(x, value=value):
+        return x
+
+    return function
+
+
+def keyword(value):
+    def function(x, *, value=value):
+        return x
+
+    return function
+
+
+def attribute(value):
+    constants = ModuleType("constants")
+    constants.value = value
+    source = {"constants": constants}
+    exec("def function(x):\n    return x + constants.value", source)
+    return source["function"]
+
+
+def helper(value):
+    def adds(x):
+        return x + value
+
+    return lambda x: adds(x)
+
+
+def within(value):
+    return eval(f"lambda x: [i for i in x if i == {value!r}]")
+
+
+class Goal(NamedTuple):
+    place: int
+
+
+LONG = np.arange(5000.0)
+
+
+@pytest.mark.parametrize("make", [closure, default, keyword, attribute, helper])
+@pytest.mark.parametrize(
+    "values",
+    [
+        (1, 2), (True, 1), (1, 1.0), ((0,), (19,)), (Goal(1), Goal(2)), ("a", "b"),
+        (LONG, np.where(LONG == 2500, -1.0, LONG)), (np.array([0.1]), np.array([0.1 + 1e-10])),
+        (np.zeros(2), np.zeros(2, np.float32)), (inner(closure(1)), inner(closure(2))),
+    ],
+)  # fmt: skip
+def test_a_digest_tells_apart_all_that_a_function_reads(make, values):
+    one, other = values
+    assert code_digest(make(one)) == code_digest(make(one)) != code_digest(make(other))
+
+
+def test_a_digest_tells_functions_within_a_function_apart():
+    assert code_digest(within(1)) == code_digest(within(1)) != code_digest(within(2))
+
+
+def test_what_a_digest_cannot_tell_is_refused():
+    with pytest.raises(TypeError, match="cannot be told"):
+        code_digest(closure(threading.Lock()))
 
 
 def test_a_twin_that_changes_is_another_type():

@@ -22,6 +22,12 @@ __all__ = ["digest", "identity"]
 # What a module holds of its own; hooks, the mode and caches say nothing of what it computes.
 _MODULE_CONTENT = ("_parameters", "_buffers", "_modules")
 _PLAIN = (int, float, complex, str, bytes, bool, type(None), torch.dtype)
+# What a class has of its making, not of what it does.
+_SAYS_NOTHING = {
+    *("__module__", "__doc__", "__dict__", "__weakref__", "__firstlineno__", "__static_attributes__"),
+    *("__slotnames__", "_abc_impl"),
+}
+_DESCRIPTORS = (types.MemberDescriptorType, types.GetSetDescriptorType, types.WrapperDescriptorType, types.MethodDescriptorType)
 # Of these packages names say enough: versions are written down beside them.
 _BUILT_ON = {"torchrl_pomdp", "torch", "torchrl", "tensordict", "numpy", "tqdm"}
 _KNOWN = _BUILT_ON.union(sys.builtin_module_names, sys.stdlib_module_names)
@@ -41,8 +47,9 @@ def digest(value: Any) -> str:
     """Hash of all that an object holds, 32 hexadecimal digits; the device does not matter.
 
     Tensors count with type, shape and numbers; modules with parameters, buffers and attributes; functions with their code,
-    defaults, closures and the globals that they read; other objects with their class and what they are pickled by. Functions
-    and classes of installed libraries that this one builds on count by name.
+    defaults, closures and the globals that they read, those of other modules too; classes with all that they define; other
+    objects with their class and what they are pickled by. What the standard library and the libraries that this one builds
+    on define counts by name.
 
     Raises:
         TypeError: if an object holds what cannot be told, such as an open file.
@@ -90,6 +97,16 @@ class _Walk:
             return _hash("generator", _tensor(value.get_state()))
         if isinstance(value, types.ModuleType):
             return _hash("module", value.__name__)
+        if isinstance(value, types.CodeType):
+            return self._code(value)
+        if isinstance(value, (staticmethod, classmethod, functools._lru_cache_wrapper)):
+            return _hash(type(value).__name__, self.digest(value.__wrapped__))
+        if isinstance(value, property):
+            return _hash("property", *map(self.digest, (value.fget, value.fset)))
+        if isinstance(value, functools.cached_property):
+            return _hash("property", self.digest(value.func))
+        if isinstance(value, _DESCRIPTORS):
+            return _hash("descriptor", value.__name__)
         if isinstance(value, type):
             return self._class(value)
         if isinstance(value, types.FunctionType):
@@ -99,7 +116,7 @@ class _Walk:
         if isinstance(value, types.BuiltinFunctionType):
             own = None if isinstance(value.__self__, types.ModuleType) else value.__self__
             return _hash("builtin", _name(value), self.digest(own))
-        if isinstance(value, functools.partial):
+        if isinstance(value, (functools.partial, functools.partialmethod)):
             return _hash("partial", *map(self.digest, (value.func, value.args, value.keywords)))
         return _hash("object", self._class(type(value)), self._state(value))
 
@@ -107,14 +124,8 @@ class _Walk:
         """A class by name, and by what it defines unless it is of a known package."""
         if _is_known(value):
             return _hash("class", _name(value))
-        own = {
-            name: getattr(entry, "__func__", entry)
-            for name, entry in vars(value).items()
-            if isinstance(entry, (types.FunctionType, staticmethod, classmethod, property, Tensor, list, dict, tuple, *_PLAIN))
-            and name not in ("__module__", "__doc__", "__dict__", "__weakref__", "__firstlineno__", "__static_attributes__")
-        }
-        getters = {name: entry.fget if isinstance(entry, property) else entry for name, entry in own.items()}
-        return _hash("class", _name(value), *(self.digest(base) for base in value.__bases__), self._items(getters))
+        own = {name: entry for name, entry in vars(value).items() if name not in _SAYS_NOTHING}
+        return _hash("class", _name(value), *(self.digest(base) for base in value.__bases__), self._items(own))
 
     def _function(self, value: types.FunctionType) -> bytes:
         """A function by name, code, defaults, closure and the globals that it reads; of a known package by name and closure."""
@@ -124,6 +135,9 @@ class _Walk:
             return _hash("function", _name(value), *map(self.digest, bound))
         names = {name for code in _codes(value.__code__) for name in code.co_names}
         read = {name: value.__globals__[name] for name in names if name in value.__globals__}
+        for name, module in [*read.items()]:
+            if isinstance(module, types.ModuleType) and module.__name__.partition(".")[0] not in _KNOWN:
+                read |= {f"{name}.{entry}": getattr(module, entry) for entry in names if hasattr(module, entry)}
         return _hash("function", _name(value), self._code(value.__code__), *map(self.digest, (*bound, read)))
 
     def _code(self, code: types.CodeType) -> bytes:

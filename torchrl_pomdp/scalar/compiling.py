@@ -7,14 +7,18 @@ import logging
 from collections.abc import Callable
 from functools import cache
 from threading import Timer
-from types import CodeType, FunctionType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from numba import njit, typeof
 from numba.core.dispatcher import Dispatcher
 
+from torchrl_pomdp.identity import digest
+
 __all__ = ["OPTIONS", "Loops", "code_digest", "entry", "inner", "outer", "products", "shared"]
 
+# Of these packages functions are told by name: numba knows them, and what is kept on disk belongs to its version.
+_BY_NAME = {"math", "numba", "numpy"}
 _LOG = logging.getLogger(__name__)
 # A compilation that takes longer, in seconds, is announced.
 _SOON = 1.0
@@ -105,34 +109,59 @@ class Loops:
 
 
 def code_digest(function: Any) -> str:
-    """Digest of a function's code, and of that of the compiled functions, records and numbers that it reads."""
-    seen: dict[str, bytes] = {}
-    _collect(function, seen)
-    content = b"".join(name.encode() + code for name, code in sorted(seen.items()))
-    return hashlib.sha256(content).hexdigest()[:16]
+    """Digest of a function's code, and of all that it reads: functions, records, numbers, attributes of modules.
+
+    Raises:
+        TypeError: if it reads what cannot be told, such as an open file.
+    """
+    return _told(function, {}).hex()[:16]
 
 
-def _collect(value: Any, seen: dict[str, bytes]) -> None:
+def _told(value: Any, seen: dict[FunctionType, int]) -> bytes:
+    """Digest of a function, compiled or not; one that was met before is told by its number."""
     function = value.py_func if isinstance(value, Dispatcher) else value
     if not isinstance(function, FunctionType):
-        return
-    name = f"{function.__module__}.{function.__qualname__}"
-    if name in seen:
-        return
-    seen[name] = _code(function.__code__)
+        return digest(function).encode()
+    if function in seen:
+        return str(seen[function]).encode()
+    seen[function] = len(seen)
+    code, names = function.__code__, sorted(_names(function.__code__))
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    for read, found in [
-        *((key, function.__globals__.get(key)) for key in function.__code__.co_names),
-        *zip(function.__code__.co_freevars, cells, strict=True),
-    ]:
-        if isinstance(found, Dispatcher):
-            _collect(found, seen)
-        elif hasattr(found, "_fields"):
-            seen[f"{name}:{read}"] = repr(found._fields).encode()
-        elif isinstance(found, (int, float, str, bool)) or hasattr(found, "dtype"):
-            seen[f"{name}:{read}"] = repr(found).encode()
+    read = [(name, function.__globals__[name]) for name in names if name in function.__globals__]
+    read += [*zip(code.co_freevars, cells, strict=True), ("", function.__defaults__)]
+    read += sorted((function.__kwdefaults__ or {}).items())
+    told = [part for name, each in read for part in (name.encode(), _read(each, names, seen))]
+    return _hash(f"{function.__module__}.{function.__qualname__}".encode(), _code(code), *told)
+
+
+def _read(value: Any, names: list[str], seen: dict[FunctionType, int]) -> bytes:
+    """Digest of what a function reads that uses the given names, such as those of a module's attributes."""
+    if isinstance(value, (Dispatcher, FunctionType)):
+        return _told(value, seen)
+    if isinstance(value, ModuleType):
+        if value.__name__.partition(".")[0] in _BY_NAME:
+            return value.__name__.encode()
+        used = [name for name in names if hasattr(value, name)]
+        return _hash(*(part for name in used for part in (name.encode(), _read(getattr(value, name), names, seen))))
+    if isinstance(value, type) and hasattr(value, "_fields"):
+        return repr(value._fields).encode()
+    if isinstance(value, tuple):
+        fields = getattr(value, "_fields", None)
+        return _hash(repr(fields).encode(), *(_read(each, names, seen) for each in value))
+    return digest(value).encode()
+
+
+def _names(code: CodeType) -> set[str]:
+    """The names that a function's code uses, and that of the functions in it."""
+    inside = (_names(each) for each in code.co_consts if isinstance(each, CodeType))
+    return set(code.co_names).union(*inside)
 
 
 def _code(code: CodeType) -> bytes:
-    constants = [each for each in code.co_consts if not isinstance(each, CodeType)]
-    return code.co_code + repr((constants, code.co_names)).encode()
+    constants = [_code(each) if isinstance(each, CodeType) else repr(each).encode() for each in code.co_consts]
+    return _hash(code.co_code, repr((code.co_names, code.co_varnames)).encode(), *constants)
+
+
+def _hash(*parts: bytes) -> bytes:
+    # With its length, so that no two lists of parts are one text.
+    return hashlib.sha256(b"".join(len(part).to_bytes(8, "little") + part for part in parts)).digest()
