@@ -11,11 +11,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_mapping, shown
+from torchrl_pomdp.checks import check_flag, check_instance, check_integer, check_mapping, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.partition import SinglePart
 from torchrl_pomdp.identity import digest
-from torchrl_pomdp.modules.rollout import Policy, controls_of
+from torchrl_pomdp.modules.rollout import Policy, check_policy, controls_of
 
 __all__ = ["Controller", "Decision"]
 
@@ -67,7 +67,7 @@ class Controller:
 
     def __init__(self, model: BeliefModel, policy: Policy) -> None:
         self.model = check_instance("model", model, BeliefModel)
-        self.policy = check_callable("policy", policy)
+        self.policy = check_policy("policy", policy, model)
         self._state: TensorDictBase | None = None
         self._steps = 0
 

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_text
 from torchrl_pomdp.config import MAX_STATES
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
-from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout, check_policy
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, scalar_engine
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.progress import progress_bar
@@ -122,7 +122,7 @@ def discounted_costs(
         50
     """
     check_instance("model", model, BeliefModel)
-    check_callable("policy", policy)
+    check_policy("policy", policy, model)
     check_callable("start", start)
     num_states = check_integer("num_states", num_states, 1, MAX_STATES)
     seed = check_integer("seed", seed)

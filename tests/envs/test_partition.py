@@ -117,6 +117,16 @@ def test_a_mixture_within_a_mixture_keeps_its_shares(linear20):
     assert (shares - torch.tensor([1.0, 1.0, 2.0, 1.0, 1.0, 2.0]) / 8).abs().max() < 0.02
 
 
+def test_what_a_proposal_keeps_is_left_alone(linear20):
+    stored = linear20.start(torch.arange(50))
+    before = stored.clone()
+    proposal = lambda keys: stored if len(keys) == 50 else linear20.training[0](keys)  # noqa: E731
+    y = InPart(linear20.model, proposal, 0)(torch.arange(50))
+    assert linear20.model.partition(y).tolist() == [0] * 50
+    assert (stored == before).all()
+    assert (linear20.model.partition(stored) != 0).any()
+
+
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.9])
 @pytest.mark.parametrize("wrap", ["function", "part", "play", "play of play"])
 def test_a_choice_does_not_follow_from_that_of_a_mixture_around_it(linear20, share, wrap):

@@ -227,6 +227,7 @@ MODEL = make_problem("line3").model
         (lambda: BeliefEnv(MODEL, 3), TypeError, "generator"),
         (lambda: BeliefEnv(MODEL, len, batch_size=3), TypeError, "batch_size"),
         (lambda: BeliefEnv(MODEL, len, batch_size=(-1,)), ValueError, "batch_size"),
+        (lambda: BeliefEnv(MODEL, len, batch_size=(2, 0)), ValueError, r"batch_size\[1\] must be at least 1, got 0"),
     ],
 )
 def test_everything_else(call, error, name):

@@ -134,8 +134,10 @@ def test_other_environments_draw_as_ever():
     torch.manual_seed(0)
     expected = spec.rand()
     torch.manual_seed(0)
-    drawn = RandomPolicy(spec)(TensorDict({"action_mask": torch.zeros(3, 5, dtype=torch.bool)}, [3]))["action"]
+    y = TensorDict({"action_mask": torch.zeros(3, 5, dtype=torch.bool)}, [3])
+    drawn = RandomPolicy(spec)(y)["action"]
     assert torch.equal(drawn, expected)
+    assert RandomPolicy(spec)(td=y)["action"].shape == (3,)
 
 
 def test_copies_of_an_environment_go_on_as_it_does():

@@ -7,9 +7,12 @@ import statistics
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite
 
+from torchrl_pomdp.envs import BeliefModel
 from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, line
-from torchrl_pomdp.modules import PolicyCost, RolloutPolicy
+from torchrl_pomdp.modules import PolicyCost, RolloutPolicy, TruncatedRollout, ZeroCost
 from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.noise import fold, permuted
@@ -52,6 +55,42 @@ def test_all_uniforms_of_a_trajectory_are_uniform_and_independent():
         counts = (row * 20).long().bincount(minlength=20)
         assert ((counts - 1500) ** 2 / 1500).sum() < 19 + 5 * (2 * 19) ** 0.5
     assert (torch.corrcoef(u) - torch.eye(6)).abs().max() < 5 / 30_000**0.5
+
+
+class Coins(BeliefModel):
+    """Two fair coins, seen each time; it costs 1 where both show heads."""
+
+    state_keys = ("belief",)
+    num_controls, num_observations, noise_dim = 1, 4, 2
+    device, dtype = torch.device("cpu"), torch.float32
+
+    def state_spec(self, batch_size=()):
+        return Composite(belief=Bounded(0.0, 1.0, shape=(*batch_size, 4)), shape=batch_size)
+
+    def action_mask(self, y):
+        return torch.ones(*y.batch_size, 1, dtype=torch.bool)
+
+    def expected_cost(self, y, u):
+        return y["belief"][..., 3]
+
+    def observation_probs(self, y, u):
+        return torch.full((*y.batch_size, 4), 0.25)
+
+    def estimator(self, y, u, z):
+        return self.successor(y, belief=torch.eye(4)[z])
+
+    def advance(self, y, u, noise):
+        heads = (noise < 0.5).long()
+        return self.expected_cost(y, u), self.estimator(y, u, 2 * heads[..., 0] + heads[..., 1])
+
+
+def test_the_uniforms_of_a_model_of_ones_own_are_independent():
+    model = Coins(0.5)
+    y = TensorDict({"belief": torch.eye(4)[:1].expand(4000, 4)}, [4000])
+    nothing = lambda y: y.set("action", torch.zeros(y.batch_size, dtype=torch.int64))  # noqa: E731
+    costs = TruncatedRollout(model, nothing, max_steps=2, terminal_cost=ZeroCost())(y, torch.arange(4000))
+    # Half of a quarter.
+    assert abs(costs.mean() - 0.125) < 4 * 0.5 * (0.1875 / 4000) ** 0.5
 
 
 def test_an_estimates_first_observations_lie_one_in_each_slice():

@@ -219,6 +219,32 @@ class Negative(Machine):
         return super().observed(y, u) - 1
 
 
+class OneMask(Machine):
+    num_agents = 2
+
+
+class NoAgents(Machine):
+    num_agents, num_agent_controls = 2, 2
+    num_controls = 4
+
+    def action_mask(self, y):
+        return torch.cat([super().action_mask(y), super().action_mask(y)[..., :1]], -1)
+
+    def expected_cost(self, y, u):
+        return super().expected_cost(y, u.clamp(max=2))
+
+    def observation_probs(self, y, u):
+        return super().observation_probs(y, u.clamp(max=2))
+
+    def estimator(self, y, u, z):
+        return super().estimator(y, u.clamp(max=2), z)
+
+
+class OtherMask(NoAgents):
+    def agent_mask(self, y):
+        return torch.tensor([True, False]).expand(*y.batch_size, 2, 2)
+
+
 BROKEN = {
     WrongSums: "observation_probs: every row holds probabilities, not negative, that sum to 1; found row 0 .* sum 0.9",
     WrongShape: r"expected_cost: the .* is a tensor of torch.float32 and shape \(32,\) .*found .* \(32, 1\)",
@@ -243,6 +269,9 @@ BROKEN = {
     Cheap: "max_cost: no stage cost is larger than max_cost, 4.5",
     Uninitialised: r"__init__: it calls that of BeliefModel; .* Call super\(\).__init__\(discount\) first",
     FewNames: "control_names: it is None or a tuple of 3 different names; found",
+    OneMask: r"num_agent_controls: there are 3 controls; found 3\^2 joint controls",
+    NoAgents: r"agent_mask: it gives bool \[\d+, 2, 2\], for every agent and its controls; found torch.bool of shape",
+    OtherMask: "agent_mask: what is legal jointly is legal for each agent",
     Negative: "observed: names of hidden variables are not negative",
 }
 

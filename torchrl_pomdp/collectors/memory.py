@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.rows import random_control, take_rows
-from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, controls_of
+from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, check_policy, controls_of
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.noise import fold, uniform
@@ -105,7 +105,7 @@ class StateMemory:
             ValueError: if ``exploration`` is not in [0, 1], ``max_steps`` is not positive, a start state does not fit the
                 model or a control of the policy is illegal.
         """
-        check_callable("policy", policy)
+        check_policy("policy", policy, self.model)
         check_callable("start", start)
         exploration = check_number("exploration", exploration, "[0, 1]")
         check_instance("workers", workers, Workers).check_device(self.model.device)

@@ -47,8 +47,8 @@ class BeliefEnv(EnvBase):
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if a size or the seed is negative; by ``step`` if a control is illegal or a state is none of the model's, by
-            ``reset`` if a given or generated state is none.
+        ValueError: if a size is not positive or the seed is negative; by ``step`` if a control is illegal or a state is none
+            of the model's, by ``reset`` if a given or generated state is none.
 
     Examples:
         >>> from torchrl_pomdp.problems import make_problem
@@ -71,7 +71,7 @@ class BeliefEnv(EnvBase):
         check_instance("model", model, BeliefModel)
         check_callable("generator", generator)
         check_instance("batch_size", batch_size, (tuple, list))
-        shape = torch.Size([check_integer(f"batch_size[{i}]", size, 0) for i, size in enumerate(batch_size)])
+        shape = torch.Size([check_integer(f"batch_size[{i}]", size, 1) for i, size in enumerate(batch_size)])
         # A state that a caller sets may be terminal already.
         super().__init__(device=model.device, batch_size=shape, allow_done_after_reset=True)
         self.model = model

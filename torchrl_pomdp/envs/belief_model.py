@@ -203,9 +203,10 @@ class BeliefModel(JointControls, ABC):
         """Names of the hidden variables that control ``u`` ``[*B]`` lets be observed, int64 ``[*B, noise_dim]``, not negative.
 
         Simulations compare controls under common random numbers: in one scenario, whoever observes a variable first finds
-        it in the same state, see :mod:`torchrl_pomdp.modules.scenarios`. One name for all: a single hidden variable.
+        it in the same state, see :mod:`torchrl_pomdp.modules.scenarios`. By default each uniform has a hidden variable of its
+        own; uniforms of one name are equal.
         """
-        return torch.zeros(*y.batch_size, self.noise_dim, dtype=torch.int64, device=self.device)
+        return torch.arange(self.noise_dim, device=self.device).expand(*y.batch_size, self.noise_dim)
 
     def is_terminal(self, y: TensorDictBase) -> Tensor:
         """Bool ``[*B]``: no cost follows from here whatever is done. A discounted model need not have such states."""

@@ -66,6 +66,9 @@ class InPart:
         flat = check_keys("keys", keys).reshape(-1)
         result = self.model.drawn(self.proposal, flat, "proposal")
         missing = (~self._accepted(result)).nonzero().squeeze(-1)
+        if missing.numel():
+            # The proposal may keep what it gives.
+            result = result.clone()
         tried = 1
         while missing.numel() and tried < self.max_tries:
             # Several candidates at once where few states are missing; the first acceptable one counts in any case.

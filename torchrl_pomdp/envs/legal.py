@@ -21,7 +21,6 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, MultiCategorical, TensorSpec
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
@@ -239,12 +238,13 @@ def _looking(draw: Callable[..., Any], spec: Callable[[Any], TensorSpec | None])
     """The method ``draw(self, tensordict)``, which first shows the mask of the TensorDict to the specs that it draws from."""
 
     @wraps(draw)
-    def look_and_draw(self: Any, tensordict: TensorDictBase | None = None) -> Any:
+    def look_and_draw(self: Any, *args: Any, **kwargs: Any) -> Any:
+        tensordict = next(iter((*args, *kwargs.values())), None)
         mask = None if tensordict is None else tensordict.get("action_mask", None)
         if mask is not None:
             for leaf in _legal(spec(self)):
                 leaf.show(mask)
-        return draw(self, tensordict)
+        return draw(self, *args, **kwargs)
 
     return look_and_draw
 

@@ -77,7 +77,7 @@ class WorldEnv(EnvBase):
         world = check_instance("model", model, BeliefModel).world()
         check_callable("generator", generator)
         check_instance("batch_size", batch_size, (tuple, list))
-        shape = torch.Size([check_integer(f"batch_size[{i}]", size, 0) for i, size in enumerate(batch_size)])
+        shape = torch.Size([check_integer(f"batch_size[{i}]", size, 1) for i, size in enumerate(batch_size)])
         # A start state may be terminal already.
         super().__init__(device=model.device, batch_size=shape, allow_done_after_reset=True)
         self.model, self.world, self.generator = model, world, generator

@@ -63,10 +63,6 @@ class LocalNetwork(TensorDictModuleBase):
         entries = evaluate_networks([self], flat, rows, [rows.numel()])
         return tensordict.update(entries.reshape(tensordict.batch_size))
 
-    def scalar_engine(self, model: BeliefModel, limits: Limited) -> SearchEngine | None:
-        """Compiled simulations, see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`."""
-        return local_engine([self], model, limits)
-
     @property
     def kind(self) -> tuple[Any, ...] | None:
         """What networks have in common that can be evaluated together; None for one that is evaluated alone."""
@@ -107,6 +103,10 @@ class PolicyNetwork(LocalNetwork):
         super().__init__(encoder, [*check_sizes("hidden", hidden), num_controls], generator)
         self.entry_keys = ["action_mask"]
         self.in_keys = [*encoder.keys, *self.entry_keys]
+
+    def scalar_engine(self, model: BeliefModel, limits: Limited) -> SearchEngine | None:
+        """Compiled simulations, see :func:`~torchrl_pomdp.modules.scalar.scalar_engine`."""
+        return local_engine([self], model, limits)
 
     def entries(self, output: Tensor, y: TensorDictBase) -> TensorDictBase:
         """``"logits"`` and ``"action"``; see the class."""

@@ -38,6 +38,11 @@ class _Partitioned(TensorDictModuleBase):
         self._name = name
         setattr(self, name, nn.ModuleList(members))
 
+    @property
+    def num_parts(self) -> int:
+        """N, for how many parts there are local modules."""
+        return len(getattr(self, self._name))
+
     # Local modules may be replaced, by others that read or write other entries.
 
     @property

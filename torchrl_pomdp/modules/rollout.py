@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from threading import Lock
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -62,6 +62,21 @@ def terminal_costs(terminal_cost: TerminalCost, y: TensorDictBase) -> Tensor:
         raise ValueError(f"terminal_cost must give costs of shape {tuple(y.batch_size)}, got {tuple(cost.shape)}")
     check_finite("terminal_cost must give finite costs", cost)
     return cost
+
+
+def check_policy(name: str, policy: Any, model: BeliefModel) -> Any:
+    """A policy or terminal cost, called ``name`` in messages, that can be called and is none for another model.
+
+    Raises:
+        TypeError: if it cannot be called.
+        ValueError: if it has local modules for other parts than the model's.
+    """
+    check_callable(name, policy)
+    num_parts = getattr(policy, "num_parts", None)
+    parts = 1 if model.partition is None else model.partition.num_parts
+    if num_parts is not None and num_parts != parts:
+        raise ValueError(f"{name} must have a local module for each of the model's {parts} parts, got {num_parts}")
+    return policy
 
 
 def controls_of(name: str, policy: Policy, y: TensorDictBase) -> Tensor:
@@ -181,7 +196,7 @@ class TruncatedRollout(MakesItsOwn):
     ) -> None:
         super().__init__()
         check_instance("model", model, BeliefModel)
-        check_callable("base_policy", base_policy)
+        check_policy("base_policy", base_policy, model)
         max_steps = check_integer("max_steps", model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
         chunk_rows = rows_at_once(_CHUNK_ROWS, model.device) if chunk_rows is None else chunk_rows
         chunk_rows = check_integer("chunk_rows", chunk_rows, 1)
@@ -190,7 +205,7 @@ class TruncatedRollout(MakesItsOwn):
         if terminal_cost is None:
             _check_rest(model, max_steps, truncation)
         else:
-            check_callable("terminal_cost", terminal_cost)
+            check_policy("terminal_cost", terminal_cost, model)
         self.model, self.base_policy, self.truncation = model, base_policy, truncation
         self.max_steps, self.terminal_cost, self.chunk_rows = max_steps, terminal_cost, chunk_rows
         self._compile = check_flag("compile", compile)
@@ -209,11 +224,15 @@ class TruncatedRollout(MakesItsOwn):
         limits = Limited(self.max_steps, self.truncation, self.terminal_cost)
         engine = scalar_engine(self.base_policy, self.model, limits)
         self.scalar = engine if isinstance(engine, ScalarEngine) else None
-        self._makeup = makeup(self.base_policy)
+        self._makeup = self._made_of()
+
+    def _made_of(self) -> tuple[Any, ...]:
+        """What the compiled loop is made of."""
+        return self.truncation, self.terminal_cost, makeup(self.base_policy), makeup(self.terminal_cost)
 
     def engine(self) -> ScalarEngine | None:
-        """The compiled loop, made anew where modules of the base policy, such as local networks, were replaced or got hooks."""
-        if makeup(self.base_policy) != self._makeup:
+        """The compiled loop, made anew where modules, such as local networks and values, were replaced or got hooks."""
+        if self._made_of() != self._makeup:
             self._make_engine()
         return self.scalar
 

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 from time import perf_counter
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,6 +168,9 @@ class ScalarEngine(SearchEngine):
         """
 
 
+# What a class defines that does something.
+_METHODS = (FunctionType, property, staticmethod, classmethod)
+
 LocalEngines = Callable[[Sequence[Any], BeliefModel, Limited], SearchEngine | None]
 _OFFERED: dict[type[BeliefModel], LocalEngines] = {}
 
@@ -198,7 +202,7 @@ def local_engine(policies: Sequence[Any], model: BeliefModel, limits: Limited) -
 def scalar_engine(policy: Any, model: BeliefModel, limits: Limited) -> SearchEngine | None:
     """Compiled simulations of a policy, or searches alone; None on an accelerator, without numba, or where none are offered.
 
-    A policy offers them by a method ``scalar_engine(model, limits)``; one that overrides ``forward`` alone does not.
+    A policy offers them by a method ``scalar_engine(model, limits)``; a class below that overrides another method does not.
 
     Args:
         policy: the policy.
@@ -221,16 +225,33 @@ def makeup(policy: Any) -> tuple[tuple[nn.Module, ...], tuple[bool, ...]]:
         its modules, none for what is no module; and, if any has hooks or a ``forward`` of its own, of which twins know
         nothing, which ones.
     """
-    members = tuple(policy.modules()) if isinstance(policy, nn.Module) else ()
-    altered = tuple(bool(m._forward_hooks or m._forward_pre_hooks or "forward" in vars(m)) for m in members)
-    return members, altered if any(altered) else ()
+    members: list[nn.Module] = []
+    if isinstance(policy, nn.Module):
+        _add_members(policy, members)
+    altered = tuple([bool(m._forward_hooks or m._forward_pre_hooks or "forward" in vars(m)) for m in members])
+    return tuple(members), altered if any(altered) else ()
+
+
+def _add_members(module: nn.Module, members: list[nn.Module]) -> None:
+    # A decision waits for this, and ``modules()`` takes three times as long.
+    members.append(module)
+    for child in module._modules.values():
+        if child is not None:
+            _add_members(child, members)
 
 
 def _has_twin(policy: Any) -> bool:
     """Whether a policy offers compiled simulations of what it does, and not of what a class does that it overrides."""
-    for kind in type(policy).__mro__:
-        if "scalar_engine" in vars(kind):
-            return not makeup(policy)[1]
-        if "forward" in vars(kind) or "__call__" in vars(kind):
-            return False
-    return False
+    kinds = type(policy).__mro__
+    offering = next((kind for kind in kinds if "scalar_engine" in vars(kind)), None)
+    if offering is None:
+        return False
+    above = kinds[: kinds.index(offering)]
+    return not any(_overrides(kind, offering) for kind in above) and not makeup(policy)[1]
+
+
+def _overrides(kind: type, offering: type) -> bool:
+    """Whether a class defines anew what the class does that offers a twin; how it is made and shown does not matter."""
+    methods = [name for name, entry in vars(kind).items() if isinstance(entry, _METHODS)]
+    ours = [name for name in methods if name == "__call__" or not name.startswith("__")]
+    return any(getattr(offering, name, None) is not getattr(nn.Module, name, None) for name in ours)

@@ -16,10 +16,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
+from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.own import MakesItsOwn
-from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy
+from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, check_policy
 from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine, local_engine, makeup, scalar_engine
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.stopping import check_stopped
@@ -110,7 +110,7 @@ class TreeSearch(MakesItsOwn, TensorDictModuleBase):
         self.model = check_instance("model", model, BeliefModel)
         model.check_enumerable(type(self).__name__, "MultiagentRollout")
         self.in_keys = list(model.state_keys)
-        self.base_policy = None if base_policy is None else check_callable("base_policy", base_policy)
+        self.base_policy = None if base_policy is None else check_policy("base_policy", base_policy, model)
         self.budget = Budget(simulations, seconds)
         self.max_steps = check_integer("max_steps", model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
         self.seed = check_integer("seed", seed)

@@ -75,6 +75,7 @@ def check_belief_model(model: BeliefModel, generator: StateGenerator, *, seed: i
         probe = Probe(model, distributions(starts, model.state_keys))
         y, terminal = _visited(probe, starts, seed)
         pairs = legal_pairs(probe, y, seed)
+        _check_agents(model, pairs)
         _check_costs(probe, pairs)
         outcomes = _enumerated(probe, pairs)
         _check_batches(probe, pairs, outcomes)
@@ -93,6 +94,10 @@ def _check_attributes(model: BeliefModel) -> None:
         value = getattr(model, name, None)
         right = isinstance(value, int) and value >= 1
         require(right, name, "it is an integer of at least 1", shown(value), f"Set self.{name} in __init__.")
+    if model.num_agents > 1:
+        joint = f"{model.num_agent_controls}^{model.num_agents} joint controls"
+        right = model.num_agent_controls**model.num_agents == model.num_controls
+        require(right, "num_agent_controls", f"there are {model.num_controls} controls", joint, "Set it, and agent_mask.")
     keys: Any = getattr(model, "state_keys", None)
     named = isinstance(keys, tuple) and len(keys) > 0 and all(isinstance(key, str) for key in keys)
     require(named, "state_keys", "it is a tuple of the names of core entries", shown(keys), "Set it in the class.")
@@ -101,6 +106,18 @@ def _check_attributes(model: BeliefModel) -> None:
         right = names is None or (isinstance(names, tuple) and len(names) == len(set(names)) == count)
         require(right, name, f"it is None or a tuple of {count} different names", shown(names), "Name all, or none.")
     _check_spec(model, keys)
+
+
+def _check_agents(model: BeliefModel, pairs: Pairs) -> None:
+    if model.num_agents == 1:
+        return
+    mask, size = model.agent_mask(pairs.y), (*pairs.y.batch_size, model.num_agents, model.num_agent_controls)
+    right = isinstance(mask, Tensor) and mask.dtype == torch.bool and tuple(mask.shape) == size
+    found = f"{mask.dtype} of shape {tuple(mask.shape)}" if isinstance(mask, Tensor) else shown(mask)
+    require(right, "agent_mask", f"it gives bool {list(size)}, for every agent and its controls", found, "Define it.")
+    legal = mask.gather(-1, model.split_controls(pairs.u).unsqueeze(-1)).all()
+    found = "a legal joint control with an illegal one of an agent"
+    require(bool(legal), "agent_mask", "what is legal jointly is legal for each agent", found, "Make both from one rule.")
 
 
 def _check_spec(model: BeliefModel, keys: tuple[str, ...]) -> None:

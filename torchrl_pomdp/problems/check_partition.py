@@ -14,7 +14,7 @@ from torchrl_pomdp.config import MAX_STATES
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.rows import random_control, take_rows
-from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, controls_of
+from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, check_policy, controls_of
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 
 __all__ = ["PartitionReport", "check_partition"]
@@ -97,7 +97,7 @@ def check_partition(
     check_instance("model", model, BeliefModel)
     check_callable("start", start)
     if policy is not None:
-        check_callable("policy", policy)
+        check_policy("policy", policy, model)
     if model.partition is None:
         raise ValueError("model must have a partition, got one without: use model.with_partition(...)")
     num_states = check_integer("num_states", num_states, 1, MAX_STATES)

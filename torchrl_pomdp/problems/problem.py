@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -104,7 +105,7 @@ class Problem:
             symmetries=_checked_symmetries(self.symmetries),
         )
         if self.spec is not None:
-            check_mapping("spec", self.spec, object)
+            object.__setattr__(self, "spec", copy.deepcopy(check_mapping("spec", self.spec, object)))
         if self.pessimistic_cost is None:
             bound = model.max_cost if model.max_cost is not None else _largest_cost(model, self.start)
             self._set(pessimistic_cost=ConstantCost(model, (bound or 1.0) / (1.0 - model.discount)))

@@ -10,7 +10,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_sequence, shown
+from torchrl_pomdp.checks import check_callable, check_flag, check_integer, check_sequence, shown
 from torchrl_pomdp.envs.belief_model import StateGenerator
 from torchrl_pomdp.envs.generators import InPart
 from torchrl_pomdp.envs.partition import Partition, SinglePart
@@ -35,7 +35,7 @@ from torchrl_pomdp.modules.repair import (
     UrgencyRepair,
 )
 from torchrl_pomdp.problems.problem import Problem
-from torchrl_pomdp.tensor_checks import check_device
+from torchrl_pomdp.tensor_checks import check_device, check_tensor
 
 __all__ = ["REPAIR_PRESETS", "repair_problem"]
 
@@ -102,7 +102,7 @@ def repair_problem(
     check_callable("start", start)
     device = check_device("device", device)
     if partition is None:
-        partition = RepairPartition(check_instance("graph", graph, Graph), torch.as_tensor(costs), device=device)
+        partition = RepairPartition(graph, check_tensor("costs", costs, finite=False), device=device)
     model = RepairModel(
         graph,
         chain,

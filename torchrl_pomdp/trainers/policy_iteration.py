@@ -44,6 +44,7 @@ from torchrl_pomdp.modules import (
     as_policy,
 )
 from torchrl_pomdp.modules.networks import LocalNetwork
+from torchrl_pomdp.modules.rollout import check_policy
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.objectives import ClassificationLoss, ValueLoss
 from torchrl_pomdp.problems.problem import Problem
@@ -148,6 +149,7 @@ class PolicyIteration:
         self.partition = check_instance("problem", problem, Problem).partition
         self.problem, self.config = problem, check_instance("config", config, PolicyIterationConfig)
         self.base_policy = as_policy(base_policy, problem.model, "base_policy")
+        check_policy("base_policy", self.base_policy, problem.model)
         self.plan = checked_plan(plan, problem)
         self.folder = None if folder is None else check_path("folder", folder)
         self.logger = None if logger is None else check_instance("logger", logger, Logger)

@@ -141,6 +141,7 @@ class Directed:
         (lambda: Graph.from_edges("x", 2, [(0, 1)], location_names=("a",)), ValueError, "location_names must hold 2 names"),
         (lambda: Graph.from_edges("x", 2, [(0, 1)], location_names=3), TypeError, "location_names must be a sequence"),
         (lambda: Graph.from_edges("x", 2, [(0, 1)], location_names=("a", 3)), TypeError, r"location_names\[1\] must be a text"),
+        (lambda: Graph.from_slots("x", [[1], [0]], ["repair"]), ValueError, "slot_names must not hold 'repair'"),
         (lambda: Graph.from_edges("x", 2, [(0, 1)], columns=[0]), ValueError, "columns must have shape"),
     ],
 )

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import math
 
 import pytest
@@ -9,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs.repair import Graph, RepairModel, damage_chain, grid, line
-from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.envs.repair import Graph, RepairModel, RepairPartition, damage_chain, grid, line
+from torchrl_pomdp.modules.repair import NeverRepairCost
+from torchrl_pomdp.problems import make_problem, repair_problem
 
 TRIANGLE = Graph.from_edges("triangle with a tail", 4, [(0, 1), (1, 2), (2, 0), (2, 3)])
 
@@ -65,6 +67,30 @@ def test_robots_at_one_location_make_one_attempt():
     assert model.estimator(y, u, torch.tensor([4]))["belief"].tolist() == [[[0, 1, 0], [1, 0, 0]]]
     nobody = model.follow(y[0], u[0], None)["belief"][0]
     torch.testing.assert_close(nobody, torch.tensor([0.6, 0.3, 0.1], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("by_location", [False, True])
+def test_what_the_caller_does_with_a_table_later_does_not_concern_the_model(by_location):
+    costs, chain = torch.tensor([0.0, 1.0, 5.0]), damage_chain((0.1, 0.3)).float().requires_grad_()
+    costs = costs.expand(3, 3).clone() if by_location else costs
+    partition = RepairPartition(line(3), costs)
+    model = RepairModel(line(3), chain, costs.requires_grad_(), 0.9, partition=partition)
+    y = model.with_features(random_states(model, 20, 0))
+    before = [model.costs.clone(), model.expected_cost(y).clone(), model.partition(y).clone(), NeverRepairCost(model)(y)]
+    copy.deepcopy(model)
+    with torch.no_grad():
+        costs.fill_(9.0)
+        chain.fill_(0.0)
+    after = [model.costs, model.expected_cost(y), model.partition(y), NeverRepairCost(model)(y)]
+    assert not model.costs.requires_grad
+    for one, other in zip(before, after, strict=True):
+        assert torch.equal(one["state_value"], other["state_value"]) if hasattr(one, "keys") else torch.equal(one, other)
+
+
+@pytest.mark.parametrize("costs", [None, [1, 2, None], {0: 1}, "abc", [0, 1, "x"], [0, 1, 10**400]])
+def test_costs_that_are_no_numbers_are_named(costs):
+    with pytest.raises((TypeError, ValueError), match="costs"):
+        repair_problem(line(3), damage_chain((0.0, 0.1)), costs, 0.9)
 
 
 def test_equal_locations_are_one_kind():

@@ -13,6 +13,7 @@ from _oracles import random_states, small_model
 from torchrl_pomdp.envs.repair import Graph, RepairModel, RepairPartition, damage_chain, grid, line, symmetries
 from torchrl_pomdp.modules import RolloutPolicy
 from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
+from torchrl_pomdp.problems import make_problem
 
 CASES = [(line(4), 1, 2), (grid(3, 2), 1, 4), (grid(2, 2), 1, 8), (line(3), 2, 4), (grid(2, 1), 3, 12)]
 
@@ -39,6 +40,16 @@ def test_the_model_does_not_see_the_difference(graph, robots, count):
         seen = probs.argmax(-1)
         successor = symmetry(model.estimator(y[rows], control, seen))
         torch.testing.assert_close(model.estimator(image[rows], renamed, z[seen])["belief"], successor["belief"])
+
+
+def test_an_image_says_nothing_of_the_part():
+    """That is a partition's, also of a problem that has been given another one."""
+    problem = make_problem("linear20").unpartitioned()
+    y = problem.model.with_features(problem.start(torch.arange(8)))
+    for symmetry in problem.symmetries:
+        image = symmetry(y)
+        assert image.get("partition", None) is None
+        assert problem.model.with_features(image)["partition"].tolist() == [0] * 8
 
 
 def test_no_two_are_the_same_and_the_identity_comes_first():

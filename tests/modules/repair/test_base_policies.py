@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from _oracles import random_states, small_model
+from tensordict import TensorDict
 
-from torchrl_pomdp.envs.repair import REPAIR, Graph, grid, line
+from torchrl_pomdp.envs.repair import REPAIR, Graph, RepairModel, damage_chain, grid, line
 from torchrl_pomdp.evaluation import compare, discounted_costs
+from torchrl_pomdp.modules import TruncatedRollout
 from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.problems import make_problem
 
@@ -52,6 +54,32 @@ def test_robots_that_stand_together_go_to_different_places():
     y = model.with_features(random_states(model, 1, 0).set("belief", belief).set("location", torch.tensor([[2, 2]])))
     left, right = 1, 2
     assert model.split_controls(UrgencyRepair(model)(y)["action"]).tolist() == [[left, right]]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("costs", "levels", "repairs"),
+    [
+        # A tenth here, and 100 at distance 9; 1 here, and 27 and 125 at distances 2 and 4: the lower index.
+        ((0.0, 0.1, 1.0, 10.0, 100.0), {0: 1, 9: 4}, True),
+        ((0.0, 1.0, 8.0, 27.0, 125.0), {0: 1, 2: 3, 4: 4}, True),
+        ((0.5, 1.0, 1.5, 10.5, 500.5), {0: 1, 9: 4}, True),
+        ((0.0, 0.1, 1.0, 10.0, 101.0), {0: 1, 9: 4}, False),
+    ],
+)
+def test_ties_go_to_the_lower_index_by_tensors_and_by_loop(costs, levels, repairs, dtype):
+    model = RepairModel(line(20), damage_chain((0.0, 0.1, 0.2, 0.3)), costs, 0.95, dtype=dtype)
+    known = torch.zeros(20, dtype=torch.int64)
+    for place, level in levels.items():
+        known[place] = level
+    y = TensorDict({"belief": torch.eye(5, dtype=dtype)[known], "location": torch.tensor([0])}).unsqueeze(0)
+    policy, keys = UrgencyRepair(model), torch.arange(1)
+    assert policy(y.copy())["action"].tolist() == [0 if repairs else 2]
+    # One step, which costs the same, and the place after it.
+    after = TruncatedRollout(model, policy, max_steps=1, terminal_cost=lambda y: y["location"][:, 0].to(dtype))
+    assert after.scalar is not None
+    paid = model.expected_cost(y, torch.tensor([0 if repairs else 2]))
+    assert torch.allclose(after(y, keys), paid + 0.95 * (0.0 if repairs else 1.0))
 
 
 @pytest.mark.parametrize(("name", "ratio"), [("linear20", 0.945), ("grid5x4", 0.84), ("grid6x6", 0.91)])

@@ -31,6 +31,7 @@ from torchrl_pomdp.modules import (
     OnLeaving,
     ParallelRollout,
     PartitionedPolicy,
+    PartitionedValue,
     PolicyCost,
     PolicyNetwork,
     RolloutPolicy,
@@ -50,6 +51,7 @@ from torchrl_pomdp.modules.repair.scalar import expected_cost, repair_engine
 from torchrl_pomdp.modules.scalar import Allocation
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.planners import POMCP
+from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.scalar import scalar_twin
 
 COSTS = (0, 0.1, 1, 10, 100)
@@ -483,6 +485,76 @@ def test_a_local_network_that_is_replaced_is_another_policy(linear20):
     assert_close(cost(y, keys), without(lambda: TruncatedRollout(model, policy))(y, keys))
 
 
+def test_networks_of_ones_own_are_left_to_tensors(linear20):
+    class Mine(PolicyNetwork):
+        pass
+
+    model, y, keys = linear20.model, linear20.start(torch.arange(8)), torch.arange(8)
+    mine = [Mine(RelativeEncoder(model), 3, (8,), generator=torch.Generator().manual_seed(0)) for _ in range(6)]
+    for policy in (mine[0], PartitionedPolicy(mine), PartitionedPolicy([mine[0]] * 6)):
+        rollout_of = TruncatedRollout(model, policy, max_steps=20, terminal_cost=ZeroCost())
+        assert rollout_of.engine() is None
+        assert rollout_of(y, keys).shape == (8,)
+
+
+def test_a_policy_whose_helper_is_overridden_is_left_to_tensors(linear20):
+    class Stays(GreedyRepair):
+        def _robot_control(self, *args):
+            return super()._robot_control(*args) * 0
+
+    class Named(GreedyRepair):
+        def __init__(self, model):
+            super().__init__(model, 0.1)
+
+        def extra_repr(self):
+            return "mine"
+
+    assert TruncatedRollout(linear20.model, Stays(linear20.model)).engine() is None
+    assert TruncatedRollout(linear20.model, Named(linear20.model)).engine() is not None
+
+
+@pytest.mark.parametrize("kind", [GreedyRepair, UrgencyRepair])
+def test_a_policy_for_another_number_of_robots_is_left_to_tensors(linear20, kind):
+    """Whose loop would write beyond its memory."""
+    several = make_problem("two_robots20").model
+    for policy in (kind(linear20.model), PartitionedPolicy([kind(linear20.model)] * 6)):
+        assert TruncatedRollout(several, policy).engine() is None
+
+
+def test_terminal_costs_that_are_replaced_or_hooked_are_noticed(linear20):
+    model, y, keys = linear20.model, linear20.start(torch.arange(8)), torch.arange(8)
+    never, steady = NeverRepairCost(model), SteadyStateCost(model)
+    value = PartitionedValue([never] * 6)
+    cut = {"truncation": AfterSteps(3), "max_steps": 3}
+    cost = TruncatedRollout(model, GreedyRepair(model), terminal_cost=value, **cut)
+    fresh = [TruncatedRollout(model, GreedyRepair(model), terminal_cost=each, **cut)(y, keys) for each in (never, steady)]
+    assert torch.equal(cost(y, keys), fresh[0])
+    for part in range(6):
+        value.values[part] = steady
+    assert torch.equal(cost(y, keys), fresh[1])
+    assert not torch.equal(*fresh)
+    cost.terminal_cost = never
+    assert torch.equal(cost(y, keys), fresh[0])
+    hook = never.register_forward_hook(lambda module, given, y: y.set("state_value", torch.zeros(y.batch_size)))
+    nothing = TruncatedRollout(model, GreedyRepair(model), terminal_cost=ZeroCost(), **cut)(y, keys)
+    assert_close(cost(y, keys), nothing)
+    hook.remove()
+    assert torch.equal(cost(y, keys), fresh[0])
+
+
+def test_what_forward_refuses_the_loop_does_not_carry_out(linear20):
+    model, y = linear20.model, linear20.start(torch.arange(4))
+    network = PolicyNetwork(RelativeEncoder(model), 5, (8,), generator=torch.Generator().manual_seed(0))
+    with pytest.raises((ValueError, RuntimeError)):
+        TruncatedRollout(model, network)(y, torch.arange(4))
+    with pytest.raises(ValueError, match="base_policy must have a local module for each of the model's 6 parts, got 3"):
+        TruncatedRollout(model, PartitionedPolicy([GreedyRepair(model)] * 3))
+    with pytest.raises(ValueError, match="terminal_cost must have a local module for each of the model's 6 parts, got 2"):
+        TruncatedRollout(model, GreedyRepair(model), terminal_cost=PartitionedValue([NeverRepairCost(model)] * 2))
+    with pytest.raises(ValueError, match="the model's 1 parts, got 6"):
+        TruncatedRollout(linear20.unpartitioned().model, PartitionedPolicy([GreedyRepair(model)] * 6))
+
+
 def test_hooks_and_replaced_forwards_are_left_to_tensors(linear20):
     """Of a network's layers, too, and whenever they come and go."""
     model, y, keys = linear20.model, linear20.start(torch.arange(8)), torch.arange(8)
@@ -530,7 +602,7 @@ def test_what_the_loop_does_not_know_is_left_to_tensors(linear20):
         lambda: TruncatedRollout(model, greedy, truncation=Other(3), **zero),
         lambda: TruncatedRollout(own, greedy, truncation=OnLeaving(), **zero),
         lambda: TruncatedRollout(model, PartitionedPolicy([greedy, UrgencyRepair(model)] * 3)),
-        lambda: TruncatedRollout(own, networks(model)),
+        lambda: TruncatedRollout(own, PartitionedPolicy(networks(model).policies[:2])),
         lambda: TruncatedRollout(model, smooth),
         lambda: TruncatedRollout(model, greedy, max_steps=1_000_000, **zero),
         lambda: TruncatedRollout(RepairModel(line(20), damage_chain((0.0, 0.1, 0.1, 0.1)), (0, 1, 1, 1, 1), 0.9), greedy),

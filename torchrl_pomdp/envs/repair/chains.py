@@ -78,7 +78,7 @@ def checked_chain(chain: Any, num_locations: int) -> Tensor:
 
     ``[K, K]`` where all locations have the same, else ``[L, K, K]``.
     """
-    chain = check_tensor("chain", chain).double()
+    chain = check_tensor("chain", chain).detach().double()
     wrong = chain.ndim not in (2, 3) or chain.shape[-1] != chain.shape[-2] or not 2 <= chain.shape[-1] <= MAX_LEVELS
     if wrong or (chain.ndim == 3 and len(chain) != num_locations):
         raise ValueError(
@@ -100,7 +100,8 @@ def checked_costs(costs: Any, num_locations: int, num_levels: int, dtype: torch.
 
     ``[K]`` where all locations have the same, else ``[L, K]``.
     """
-    costs = check_tensor("costs", costs, finite=False)
+    # A copy: what the caller does with the tensor does not concern the model.
+    costs = check_tensor("costs", costs, finite=False).detach().clone()
     if costs.shape not in ((num_levels,), (num_locations, num_levels)):
         raise ValueError(
             f"costs must have shape ({num_levels},), one for each level of chain, or ({num_locations}, {num_levels}) for every "

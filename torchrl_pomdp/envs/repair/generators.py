@@ -57,7 +57,7 @@ class UniformStart:
 
 
 class CalibratedStart:
-    """The calibrated start states: a fraction of the locations possibly damaged, robots anywhere.
+    """The calibrated start states: a fraction of the locations, at least one of them, possibly damaged, robots anywhere.
 
     The belief of a possibly damaged location is Dirichlet(1, …, 1) over the levels, the others are surely at level 0.
 
@@ -93,8 +93,9 @@ class CalibratedStart:
 class RandomState:
     """Random feature states of a phase, for training (paper, Section VI-C, "random generation of feature states").
 
-    The number of possibly damaged locations is uniform between two fractions, each belief is Dirichlet(1, …, 1) and has
-    then degraded for a random number of stages; the robots are anywhere and have observed their locations.
+    The number of possibly damaged locations, at least one, is uniform between two fractions, each belief is
+    Dirichlet(1, …, 1) and has then degraded for a random number of stages; the robots are anywhere and have observed their
+    locations.
 
     Args:
         model: the repair model.

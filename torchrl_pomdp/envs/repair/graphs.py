@@ -63,6 +63,8 @@ class Graph:
         table = _slot_table(self.neighbours)
         size, num_slots = table.shape
         names = _names("slot_names", self.slot_names, num_slots)
+        if "repair" in names:
+            raise ValueError("slot_names must not hold 'repair', the name of the control that does not move")
         called = _sequence("location_names", self.location_names) or [str(location) for location in range(size)]
         called = _names("location_names", called, size)
         distances = _distances(table)
@@ -92,7 +94,7 @@ class Graph:
             >>> Graph.from_slots("pipe", [[1], [0]], ["across"], [0, 1], [0, 0]).distances.tolist()
             [[0, 1], [1, 0]]
         """
-        values: Any = (neighbours, slot_names, columns, rows, location_names)
+        values: Sequence[Any] = (neighbours, slot_names, columns, rows, location_names)
         return cls(name, *values)
 
     @classmethod
@@ -341,7 +343,7 @@ def _coordinates(columns: Any, rows: Any, distances: Tensor) -> tuple[Tensor, Te
         return places(distances)
     size = len(distances)
     given = [("columns", [0] * size if columns is None else columns), ("rows", [0] * size if rows is None else rows)]
-    across, down = (check_tensor(n, check_tensor(n, c, (size,)).float()) for n, c in given)
+    across, down = (check_tensor(n, check_tensor(n, c, (size,)).float()).detach().clone() for n, c in given)
     _check_distinct(across, down)
     return across, down
 

@@ -64,7 +64,7 @@ class RepairPartition(Partition):
         super().__init__()
         check_instance("graph", graph, Graph)
         self.damage_threshold = check_number("damage_threshold", damage_threshold, "[0, 1)")
-        costs = check_tensor("costs", costs, finite=False)
+        costs = check_tensor("costs", costs, finite=False).detach().clone()
         shapes = costs.ndim == 1 or (costs.ndim == 2 and len(costs) == graph.num_locations)
         if not shapes or costs.shape[-1] < 2:
             raise ValueError(

@@ -55,8 +55,10 @@ class Symmetry:
     def __call__(self, y: TensorDictBase) -> TensorDictBase:
         """The images of feature states and labels ``[*B]``; entries that it does not know are the same for the image.
 
+        The part is left out: a partition gives it, which need not be the model's.
+
         Args:
-            y: ``belief`` and ``location``, and any of ``action_mask``, ``partition``, ``action`` and ``q_factors``, the last
+            y: ``belief`` and ``location``, and any of ``action_mask``, ``action`` and ``q_factors``, the last
                 by joint controls or by robots.
         """
         image, keys = check_entries("y", y, ("belief", "location")).copy(), set(y.keys())
@@ -69,9 +71,7 @@ class Symmetry:
         for key in ("action_mask", "q_factors"):
             if key in keys:
                 image.set(key, self._by_control(y.get(key), y.ndim))
-        if self.model.partition is not None and "partition" in keys:
-            image.set("partition", self.model.partition(image))
-        return image
+        return image.exclude("partition")
 
     def _by_control(self, values: Tensor, batch_dims: int) -> Tensor:
         """Images of numbers of joint controls ``[*B, U]``, or of robots' controls ``[*B, R, A]``."""

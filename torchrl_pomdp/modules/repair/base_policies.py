@@ -87,7 +87,7 @@ class UrgencyRepair(TensorDictModuleBase):
     r"""Go where damage costs most for the way there, and repair: the location that maximises :math:`(b\cdot c-c_0)/(d+1)^3`.
 
     :math:`b\cdot c-c_0` is what a location is expected to cost per stage more than if it were intact, d the number of moves
-    to it. Ties go to the location,
+    to it, both as exact as numbers can be and then rounded to the model's type, so that ties are ties. They go to the location,
     then to the control, with the lower index. Robots choose one after the other, each among the locations that no earlier
     robot has chosen. A robot for which no costly location is left takes its first move.
 
@@ -108,7 +108,7 @@ class UrgencyRepair(TensorDictModuleBase):
 
     in_keys = ["belief", "location"]
     out_keys = ["action"]
-    nearness: Tensor
+    remoteness: Tensor
     indices: Tensor
     first_moves: Tensor
 
@@ -117,10 +117,11 @@ class UrgencyRepair(TensorDictModuleBase):
         self.model = check_instance("model", model, RepairModel)
         self.exponent = check_number("exponent", exponent, "[0, inf)")
         # What a level costs more than an intact location.
-        self._prices = prices(model.costs - model.costs[..., :1])
+        costs = model.costs.double()
+        self._prices = prices(costs - costs[..., :1])
         # [L, L], target by origin.
-        nearness = (model.graph.distances.T + 1.0) ** -self.exponent
-        self.register_buffer("nearness", nearness.to(model.device, model.dtype), persistent=False)
+        remoteness = (model.graph.distances.T.double() + 1.0) ** self.exponent
+        self.register_buffer("remoteness", remoteness.to(model.device), persistent=False)
         indices = torch.arange(model.num_locations, dtype=model.dtype, device=model.device).unsqueeze(-1)
         self.register_buffer("indices", indices, persistent=False)
         self.register_buffer("first_moves", first_moves(model), persistent=False)
@@ -131,7 +132,7 @@ class UrgencyRepair(TensorDictModuleBase):
 
         costs = self.model.costs.double()
         intact = costs[..., 0].expand(self.model.num_locations).numpy().copy()
-        data = self.nearness.double().numpy().T.copy(), intact, float((costs - costs[..., :1]).max())
+        data = self.remoteness.numpy().T.copy(), intact, float((costs - costs[..., :1]).max())
         return engine.repair_engine(twins.urgency, data, self.model, model, limits, numbers=self.model.num_robots)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -140,11 +141,11 @@ class UrgencyRepair(TensorDictModuleBase):
         model = self.model
         belief = tensordict.get("belief").reshape(-1, model.num_locations, model.num_levels)
         location = tensordict.get("location").reshape(-1, model.num_robots)
-        costs = location_costs(belief.permute(1, 2, 0), self._prices)
+        costs = location_costs(belief.permute(1, 2, 0).double(), self._prices)
         controls = []
         for robot in range(model.num_robots):
             place = location[:, robot]
-            urgency = costs * _columns(self.nearness, place)
+            urgency = (costs / _columns(self.remoteness, place)).to(model.dtype)
             highest = urgency.amax(0)
             # The first location that attains the highest: all others rank behind it. Much faster than argmax.
             rank = (highest - urgency).sign_().mul_(model.num_locations).add_(self.indices).amin(0)

@@ -27,7 +27,7 @@ from torchrl_pomdp.modules.repair.scalar.states import fingerprints, valid
 from torchrl_pomdp.modules.repair.scalar.tables import by_location, kinds, make_tables
 from torchrl_pomdp.modules.repair.scalar.trajectories import NEVER, Limits, Trajectories, Work, simulate
 from torchrl_pomdp.modules.repair.terminal_costs import NeverRepairCost, SteadyStateCost
-from torchrl_pomdp.modules.scalar import Allocation, Cut, Limited, Roots, ScalarEngine
+from torchrl_pomdp.modules.scalar import Allocation, Cut, Limited, Roots, ScalarEngine, makeup
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.terminal_costs import ConstantCost, ZeroCost
 from torchrl_pomdp.modules.threads import map_threads
@@ -97,9 +97,9 @@ def repair_engine(
         'RepairEngine'
     """
     # By content: a copy of a policy, such as a collector's, has a model of its own.
-    if type(model) is not RepairModel or not torch.equal(own.graph.neighbours, model.graph.neighbours):
+    if type(model) is not RepairModel or own.num_robots != model.num_robots:
         return None
-    if not _has_costs_of(own, model):
+    if not torch.equal(own.graph.neighbours, model.graph.neighbours) or not _has_costs_of(own, model):
         return None
     rules = () if limits.truncation is None else limits.truncation.rules
     known = all(type(rule) in (AfterSteps, OnEntering, OnLeaving) for rule in rules)
@@ -330,8 +330,12 @@ class RepairEngine(ScalarEngine):
 def _closed_form(model: RepairModel, terminal_cost: Any) -> tuple[float, NDArray[np.float64]] | None:
     """A terminal cost as a constant and a cost for each level of each location; None where it is none of these."""
     nothing = np.zeros((model.num_locations, 0))
-    if type(terminal_cost) is PartitionedValue and len(set(terminal_cost.values)) == 1:
-        terminal_cost = terminal_cost.values[0]
+    if makeup(terminal_cost)[1]:
+        return None
+    parts = 1 if model.partition is None else model.partition.num_parts
+    values: Sequence[Any] = list(terminal_cost.values) if type(terminal_cost) is PartitionedValue else []
+    if len(values) == parts and len(set(values)) == 1:
+        terminal_cost = values[0]
     kind = type(terminal_cost)
     if terminal_cost is None or kind is ZeroCost:
         return 0.0, nothing

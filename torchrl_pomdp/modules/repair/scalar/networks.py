@@ -13,7 +13,7 @@ from torch import nn
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.envs.repair.partition import RepairPartition
 from torchrl_pomdp.modules.encoders import FlatEncoder
-from torchrl_pomdp.modules.networks import PolicyNetwork
+from torchrl_pomdp.modules.networks import LocalNetwork, PolicyNetwork
 from torchrl_pomdp.modules.repair.encoders import RelativeEncoder
 from torchrl_pomdp.modules.repair.scalar.engine import RepairEngine, repair_engine
 from torchrl_pomdp.modules.repair.scalar.twins import greedy, networks, random
@@ -37,15 +37,19 @@ def network_engine(policies: Sequence[Any], model: RepairModel, limits: Limited)
     """
     if not policies:
         return repair_engine(random, (), model, model, limits)
+    parts = 1 if model.partition is None else model.partition.num_parts
     own = list(dict.fromkeys(policy for policy in policies if type(policy) is PolicyNetwork))
     others = list(dict.fromkeys(policy for policy in policies if policy not in own))
+    # Another network is asked for its engine by coming here again.
+    if len(policies) not in (1, parts) or any(isinstance(policy, LocalNetwork) for policy in others):
+        return None
     base = scalar_engine(others[0], model, limits) if len(others) == 1 else None
     if not own:
         return base
     features = _features(own[0].encoder, model)
-    parts = model.partition.num_parts if type(model.partition) is RepairPartition else 1
-    unknown = len(others) > 1 or (others and not isinstance(base, RepairEngine)) or len(policies) not in (1, parts)
-    if unknown or features is None or not _alike(own):
+    unknown = len(others) > 1 or (others and not isinstance(base, RepairEngine))
+    unknown = unknown or (len(policies) > 1 and type(model.partition) is not RepairPartition)
+    if unknown or features is None or not _alike(own) or own[0].network[-1].out_features != model.num_controls:
         return None
     which = np.array([own.index(policy) if policy in own else -1 for policy in policies])
     layers = [[layer for layer in network.network if isinstance(layer, nn.Linear)] for network in own]

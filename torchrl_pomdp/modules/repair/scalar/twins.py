@@ -56,25 +56,26 @@ def greedy(data, view, controls):
 def urgency(data, view, controls):
     """The location with the largest extra cost over a power of the distance.
 
-    ``data`` holds the inverse of these powers, the cost of each location that is intact, and the largest extra cost.
+    ``data`` holds these powers, the cost of each location that is intact, and the largest extra cost.
     """
-    tables, (nearness, intact_cost, highest) = view.tables, data
+    tables, (remoteness, intact_cost, highest) = view.tables, data
+    rounded = view.intact.dtype.type
     targets = view.work
     for robot in range(len(controls)):
         origin = view.location[robot]
         best, chosen = 0.0, -1
         for i in range(tables.order.shape[1]):
             place = tables.order[origin, i]
-            near = nearness[origin, place]
+            away = remoteness[origin, place]
             # What lies further away cannot be more urgent.
-            if highest * near < best:
+            if rounded(highest / away) < best:
                 break
             if view.intact[place] == 1.0:
                 continue
             taken = False
             for other in range(robot):
                 taken = taken or targets[other] == place
-            urgent = 0.0 if taken else (expected_cost(view, place) - intact_cost[place]) * near
+            urgent = 0.0 if taken else rounded((expected_cost(view, place) - intact_cost[place]) / away)
             if urgent > best or (urgent == best and 0 <= place < chosen):
                 best, chosen = urgent, place
         targets[robot] = chosen
