@@ -5,7 +5,9 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+import threading
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 
 import networkx as nx
 import numpy as np
@@ -553,6 +555,23 @@ def test_what_forward_refuses_the_loop_does_not_carry_out(linear20):
         TruncatedRollout(model, GreedyRepair(model), terminal_cost=PartitionedValue([NeverRepairCost(model)] * 2))
     with pytest.raises(ValueError, match="the model's 1 parts, got 6"):
         TruncatedRollout(linear20.unpartitioned().model, PartitionedPolicy([GreedyRepair(model)] * 6))
+
+
+def test_threads_that_share_a_rollout_read_whole_weights(linear20):
+    """Also where the first of them has only begun to look for the layers."""
+    model, y, keys = linear20.model, linear20.start(torch.arange(4)), torch.arange(4)
+    policy = networks(model)
+    expected = TruncatedRollout(model, policy)(y, keys)
+    for _ in range(20):
+        cost = TruncatedRollout(model, policy)
+        begin = threading.Barrier(4)
+
+        def simulate(_, cost=cost, begin=begin):
+            begin.wait()
+            return cost(y, keys)
+
+        with ThreadPoolExecutor(4) as pool:
+            assert all(torch.equal(found, expected) for found in pool.map(simulate, range(4)))
 
 
 def test_hooks_and_replaced_forwards_are_left_to_tensors(linear20):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -101,13 +102,18 @@ class _Weights:
         self._where: list[int] = []
         self._memory: tuple[NDArray[np.uint32], ...] = ()
         self._copied: int | None = None
-        self._loops = Loops()
+        self._loops, self._lock = Loops(), Lock()
 
     def refresh(self) -> None:
         """Copy the weights again if they have changed.
 
         Versions of tensors do not tell: what is written through ``.data``, as TorchRL does, raises none.
         """
+        # Several threads may share a rollout.
+        with self._lock:
+            self._refresh()
+
+    def _refresh(self) -> None:
         now = [p for each in self.layers for layer in each for p in (layer.weight, layer.bias)]
         where = [p.data_ptr() for p in now]
         whole = all(p.is_contiguous() for p in now)
