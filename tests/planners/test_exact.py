@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from itertools import pairwise, product
+from math import inf
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from _oracles import COSTS, line3_cost
@@ -15,6 +18,8 @@ from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, l
 from torchrl_pomdp.envs.repair.tabular import joint_belief, tabular_model
 from torchrl_pomdp.evaluation import discounted_costs, estimate
 from torchrl_pomdp.planners import AlphaVectorPolicy, Interval, belief_mdp, solve
+from torchrl_pomdp.planners.joint_table import JointTable
+from torchrl_pomdp.planners.point_based import Search
 from torchrl_pomdp.problems import crying_baby, tiger
 from torchrl_pomdp.problems.random_tabular import random_model
 
@@ -209,6 +214,110 @@ def test_time_that_is_over_leaves_valid_bounds():
     assert found.seconds < 5.0
 
 
+def renewal():
+    """Seen states: going on is free in the first one and costs 5 in the other; mending costs 2 or 8."""
+    transition = torch.tensor([[[0.9, 0.1], [0.0, 1.0]], [[1.0, 0.0], [1.0, 0.0]]], dtype=torch.float64)
+    return TabularModel(transition, torch.eye(2).expand(2, 2, 2), [[0.0, 5.0], [2.0, 8.0]], 0.999, dtype=torch.float64)
+
+
+def test_what_later_plans_and_points_surpass_is_dropped():
+    model = renewal()
+    search = Search(JointTable(model), inf)
+    root, made = search.start(np.array([1.0, 0.0])), []
+    add, add_point = search._add_vector, search._add_point
+    search._add_vector = lambda *of: (made.append(0), add(*of))
+    search._add_point = lambda *of: (made.append(1), add_point(*of))
+    while len(made) < 4000:
+        search.trial(root, 0.5 * root.gap, inf)
+    assert made.count(0) > 1000
+    assert made.count(1) > 1000
+    # A trial adds some hundreds.
+    assert search.vectors.count < 600
+    assert search._bits.count < 600
+    optimum = float(belief_mdp(model, torch.tensor([1.0, 0.0])).optimal_cost()[0])
+    assert root.lower <= optimum <= root.upper
+    assert 2 <= len(search.kept()) <= 4
+
+
+def test_plans_that_are_kept_go_on_with_plans_that_are_kept():
+    model = renewal()
+    found = solve(model, torch.tensor([1.0, 0.0]), seconds=1.0)
+    costs, vectors = found.policy.cost, found.policy._costs.T
+    table = JointTable(model)
+    y = TensorDict({"belief": torch.eye(2, dtype=torch.float64)}, [2])
+    least = costs(y).numpy()
+    for u, vector in zip(found.policy.controls.tolist(), vectors.numpy(), strict=True):
+        if u >= 0:
+            assert (table._step(u, least) <= vector * (1 + 1e-12)).all()
+
+
+@pytest.mark.parametrize("bound", ["worst", "constant", "informed"])
+def test_first_bounds_hold_whenever_they_are_left(bound):
+    """They take 20000 stages, or one."""
+    table = JointTable(renewal())
+    optimum = belief_mdp(renewal(), torch.tensor([1.0, 0.0])).optimal_cost()[:2].numpy()
+    early, late = (_first_bound(table, bound, until) for until in (0.0, inf))
+    if bound == "informed":
+        assert (early < late).all()
+        assert (late <= optimum * (1 + 1e-9)).all()
+    else:
+        assert (early > late).all()
+        assert (late >= optimum * (1 - 1e-9)).all()
+
+
+def _first_bound(table, bound, until):
+    if bound == "constant":
+        return table.constant(0, table.worst(until), until)
+    return table.worst(until) if bound == "worst" else table.informed(until).min(1)
+
+
+def test_a_control_that_becomes_illegal_later_has_no_constant_plan_even_without_time():
+    # Control 0 leads from 0 to 1 to 2, where it is illegal.
+    move = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]).expand(2, 3, 3)
+    legal = torch.tensor([[True, True], [True, True], [False, True]])
+    model = TabularModel(move, torch.ones(2, 3, 1), torch.ones(2, 3), 0.5, legal=legal)
+    table = JointTable(model)
+    assert np.isinf(table.constant(0, table.worst(0.0), 0.0)).all()
+    assert np.isfinite(table.constant(1, table.worst(0.0), 0.0)).all()
+
+
+def test_rounding_is_measured_by_the_costs_to_go():
+    # 100 once, then nothing; at 100 for ever it would be 1e8.
+    ends = torch.tensor([[[0.0, 1.0], [0.0, 1.0]]])
+    model = TabularModel(ends, torch.ones(1, 2, 1), [[100.0, 0.0]], 0.999999, dtype=torch.float64)
+    found = solve(model, torch.tensor([1.0, 0.0]))
+    assert found.lower <= 100.0 <= found.upper
+    assert found.interval.relative_gap < 1e-6
+
+
+def test_the_interval_is_as_narrow_as_was_asked_for_with_its_rounding():
+    # What rounding can do alone is wider than the gap that is asked for: the search ends and says so.
+    ends = torch.tensor([[[0.0, 1.0], [0.0, 1.0]]])
+    model = TabularModel(ends, torch.ones(1, 2, 1), [[100.0, 0.0]], 0.999999, dtype=torch.float64)
+    found = solve(model, torch.tensor([1.0, 0.0]), relative_gap=1e-9)
+    assert found.interval.relative_gap > 1e-9
+    assert found.lower <= 100.0 <= found.upper
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_no_interval_is_wider_than_all_costs(sign):
+    # A number whose quotient by 1 - discount is rounded, for ever.
+    found = solve(blind([[sign]], discount=0.999999), torch.tensor([1.0]), seconds=0.1)
+    optimum = Fraction(sign) / (1 - Fraction(0.999999))
+    assert Fraction(found.lower) <= optimum <= Fraction(found.upper)
+    assert min(abs(found.lower - float(optimum)), abs(found.upper - float(optimum))) < 1e-8
+
+
+def test_the_policy_meets_the_upper_bound_where_plans_cost_nearly_the_same():
+    # In state 0 control 1 costs a little more, for ever; in state 1 only it is free.
+    stay, seen = torch.eye(2).expand(2, 2, 2), torch.eye(2).expand(2, 2, 2)
+    model = TabularModel(stay, seen, [[1.0, 1.0], [1.0 + 5e-10, 0.0]], 0.5, dtype=torch.float64)
+    found = solve(model, torch.eye(2, dtype=torch.float64), relative_gap=1e-12)
+    mdp = belief_mdp(model, torch.tensor([1.0, 0.0]))
+    assert float(mdp.policy_cost(found.policy(mdp.states())["action"])[0]) <= found.by_start[0].upper
+    assert found.by_start[0].lower <= 2.0 <= found.by_start[0].upper < 2.0 + 2e-9
+
+
 def test_the_policy_meets_the_upper_bound_on_the_line_of_3():
     model, _ = repair("line of 3")
     found = solve(tabular_model(model), joint_belief(model, starts(model)))
@@ -248,8 +357,15 @@ def test_any_legal_control_is_the_first_one():
 
 
 def test_nearly_equal_vectors_go_to_the_first():
-    policy = AlphaVectorPolicy(tiger().model, torch.tensor([[1.0 + 1e-12, 1.0], [1.0, 1.0]]).double(), torch.tensor([2, 1]))
+    vectors = torch.tensor([[1.0 + 1e-12, 1.0], [1.0, 1.0]], dtype=torch.float64)
+    policy = AlphaVectorPolicy(tiger().model, vectors, torch.tensor([2, 1]))
     assert policy(FixedBelief(torch.tensor([0.5, 0.5]))(torch.arange(3)))["action"].tolist() == [2, 2, 2]
+
+
+def test_vectors_that_differ_by_more_than_rounding_do_not():
+    vectors = torch.tensor([[1.0 + 1e-10, 1.0], [1.0, 1.0]], dtype=torch.float64)
+    policy = AlphaVectorPolicy(tiger().model, vectors, torch.tensor([2, 1]))
+    assert policy(FixedBelief(torch.tensor([0.5, 0.5]))(torch.arange(3)))["action"].tolist() == [1, 1, 1]
 
 
 def test_a_belief_without_a_legal_plan_is_refused():

@@ -22,8 +22,8 @@ from torchrl_pomdp.tensor_checks import check_distributions, check_entries, chec
 
 __all__ = ["AlphaVectorPolicy", "Interval", "Solution", "solve"]
 
-# Vectors whose costs agree up to this share are equal: the first of them is taken.
-_EQUAL = 1e-9
+# Vectors whose costs agree up to this share, times 1 - discount, are equal: the first of them is taken.
+_EQUAL = 1e-10
 # A trial halves the gap where it starts.
 _TRIAL = 0.5
 
@@ -92,6 +92,7 @@ class AlphaVectorPolicy(TensorDictModuleBase):
         self.register_buffer("_costs", vectors.nan_to_num(posinf=0.0).T.to(model.device), persistent=False)
         self.register_buffer("_illegal", vectors.isinf().T.float().to(model.device), persistent=False)
         self.register_buffer("controls", controls.to(model.device), persistent=False)
+        self._equal = _tolerance(model.discount, model.num_states)
 
     def __len__(self) -> int:
         """The number of vectors."""
@@ -102,7 +103,7 @@ class AlphaVectorPolicy(TensorDictModuleBase):
         cost = self._plan_costs(tensordict)
         least = cost.amin(-1, keepdim=True)
         # Rounding depends on the batch: of nearly equal ones the first.
-        u = self.controls[(cost <= least + _EQUAL * least.abs()).to(torch.int8).argmax(-1)]
+        u = self.controls[(cost <= least + self._equal * least.abs()).to(torch.int8).argmax(-1)]
         first = self.model.action_mask(tensordict).to(torch.int8).argmax(-1)
         return tensordict.set("action", torch.where(u == ANY, first, u))
 
@@ -176,17 +177,21 @@ def solve(
     support; negative costs are rewards. All is computed in double precision, with the tables of the model.
 
     The bounds are certified: each holds at any time, whatever the search has seen. For rounding, the interval is widened by
-    the most that it can do to first order, :math:`(4k\epsilon+s\,10^{-14})\,c/(1-\alpha)`: at most k numbers of precision
-    :math:`\epsilon` are added up, s is the size of the largest support that was met, beliefs that agree to 14 digits are one,
-    and c bounds all costs. Rows of tables are scaled to sum to one; a model in float32 has tables that were rounded before.
+    the most that it can do to first order, :math:`(16k\epsilon+4s\,10^{-14}+t)\,h/(1-\alpha)`, though never to more than costs
+    can add up to. At most k numbers of precision :math:`\epsilon` are added up; s is the size of the largest support that was
+    met, beliefs that agree to 14 digits are one; the policy takes plans for equal whose costs agree up to a share t, the larger
+    of :math:`10^{-10}(1-\alpha)` and 4n :math:`\epsilon`; and h bounds the costs to go at the beliefs that count: the largest
+    stage cost, plus what no belief costs more than, plus the size of the least entry of a bound. Rows of tables are scaled to
+    sum to one; a model in float32 has tables that were rounded before.
 
     Args:
         model: the model.
         belief: start belief ``[n]``, or several ``[S, n]``, each as likely as another.
 
     Keyword Args:
-        relative_gap: the search ends when the interval's width is this share of its larger absolute value, in (0, 1).
-        seconds: the search ends after so many seconds at the latest, once it has its first bounds.
+        relative_gap: the search ends when the interval's width is this share of its larger absolute value, in (0, 1); or when
+            time is over or rounding is all that is left, with a wider interval.
+        seconds: the search ends after so many seconds at the latest, but for the step that it is in.
         progress: whether to show the trials and the interval on a terminal.
 
     Raises:
@@ -214,18 +219,18 @@ def solve(
     # Bounds are added up and subtracted.
     if not math.isfinite(4.0 * largest / (1.0 - table.discount)):
         raise ValueError(f"model must have smaller costs, got a discounted sum of up to {largest:g}: it overflows")
-    search = Search(table)
+    search = Search(table, until)
     roots = [search.start(row) for row in beliefs]
     with progress_bar(None, "trial", "solve", progress) as bar:
-        while _mean(roots).relative_gap > relative_gap and monotonic() < until:
+        while _widened(_mean(roots), search).relative_gap > relative_gap and monotonic() < until:
             root = max(roots, key=lambda node: node.gap)
             if root.gap <= _rounding(search):
                 break
             search.trial(root, _TRIAL * root.gap, until)
             bar.update()
             bar.set_postfix_str("{:.6g} to {:.6g}".format(*_mean(roots)), refresh=False)
-    by_start, mean = [Interval(root.lower, root.upper) for root in roots], _mean(roots)
-    whole, *each = (_widened(interval, _rounding(search)) for interval in (mean, *by_start))
+    by_start = (Interval(root.lower, root.upper) for root in roots)
+    whole, *each = (_widened(interval, search) for interval in (_mean(roots), *by_start))
     return Solution(whole, tuple(each), _policy(model, search), monotonic() - begin)
 
 
@@ -242,15 +247,28 @@ def _mean(roots: list[Node]) -> Interval:
     return Interval(float(np.mean([root.lower for root in roots])), float(np.mean([root.upper for root in roots])))
 
 
-def _widened(interval: Interval, by: float) -> Interval:
-    return Interval(float(interval.lower - by), float(interval.upper + by))
+def _widened(interval: Interval, search: Search) -> Interval:
+    """An interval with all that rounding can do; costs add up to no more than the table's bounds."""
+    by, table = _rounding(search), search.table
+    return Interval(float(max(interval.lower - by, table.lowest)), float(min(interval.upper + by, table.highest)))
 
 
 def _rounding(search: Search) -> float:
-    """The most that rounding can do to a bound, to first order."""
+    """The most that rounding can do to a bound, to first order, and plans that are taken for equal to the policy.
+
+    A bound holds if it does stage by stage, each time up to an error; errors add up to a stage's over 1 - discount. That of a
+    stage is a share of the absolute numbers that are added up, where the policy, or for the lower bound the best one, comes to.
+    By the signs of costs these are at most four times the sum below.
+    """
     table = search.table
-    size = max(-table.lowest, table.highest) / (1.0 - table.discount)
-    return (4 * table.terms * np.finfo(np.float64).eps + search.largest_support * 10.0**-DIGITS) * size
+    size = table.largest_cost + max(0.0, search.top) + max(0.0, -search.bottom)
+    sums = 4 * table.terms * np.finfo(np.float64).eps + search.largest_support * 10.0**-DIGITS
+    return float((4.0 * sums + _tolerance(table.discount, table.num_states)) * size / (1.0 - table.discount))
+
+
+def _tolerance(discount: float, num_states: int) -> float:
+    """Up to which share costs of plans are equal: in all stages together little, but not less than they are rounded by."""
+    return max(_EQUAL * (1.0 - discount), 4 * num_states * float(np.finfo(np.float64).eps))
 
 
 def _policy(model: TabularModel, search: Search) -> AlphaVectorPolicy:

@@ -7,6 +7,7 @@ zero, sorted by control, state and observation.
 from __future__ import annotations
 
 from itertools import pairwise
+from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
@@ -50,8 +51,9 @@ class JointTable:
         cost: stage costs ``[U, n]``, ``+inf`` where a control is illegal.
         discount: :math:`\alpha`.
         free: states from which no cost follows, whatever is done, bool ``[n]``.
-        lowest: a bound of all costs from below.
-        highest: a bound of all costs from above.
+        largest_cost: the largest absolute value of a stage cost.
+        lowest: a bound of all discounted sums of costs from below.
+        highest: a bound of all discounted sums of costs from above.
 
     Examples:
         >>> from torchrl_pomdp.problems import tiger
@@ -69,8 +71,11 @@ class JointTable:
         self.controls = [_control(*part, self.num_states) for part in _joined(model)]
         self.free = self._free()
         finite = self.cost[np.isfinite(self.cost)]
-        self.lowest = min(0.0, float(finite.min())) / (1.0 - self.discount)
-        self.highest = max(0.0, float(finite.max())) / (1.0 - self.discount)
+        self.largest_cost = float(np.abs(finite).max())
+        # A little more than the quotient, which is rounded.
+        stages = (1.0 + 4.0 * float(np.finfo(np.float64).eps)) / (1.0 - self.discount)
+        self.lowest = min(0.0, float(finite.min())) * stages
+        self.highest = max(0.0, float(finite.max())) * stages
 
     def spread(self, u: int, states: Integers, probs: Floats) -> Floats:
         """P(observation z, next state j) ``[Z, n]`` after control ``u`` at a belief, given by its support."""
@@ -87,36 +92,41 @@ class JointTable:
         each = self.controls[u]
         return self.cost[u] + self.discount * np.add.reduceat(each.p * vectors[chosen[each.z], each.j], each.rows)
 
-    def worst(self) -> Floats:
-        """Cost ``[n]`` of the worst legal play where the state is seen: no legal policy of any belief costs more."""
+    def worst(self, until: float) -> Floats:
+        """Cost ``[n]`` of the worst legal play where the state is seen: no legal policy of any belief costs more.
+
+        This bound and the next two never turn back, so that they may be stopped at any time and hold up to the rounding of a
+        single stage; at the time ``until`` they are.
+        """
         value = np.where(self.free, 0.0, self.highest)
         for _ in range(_MOST_ROUNDS):
             steps = self._steps(value).max(0, where=np.isfinite(self.cost), initial=-np.inf)
-            before, value = value, np.where(self.free, 0.0, steps)
-            if np.abs(before - value).max() <= _SETTLED * max(1.0, np.abs(value).max()):
+            before, value = value, np.where(self.free, 0.0, np.minimum(value, steps))
+            if np.abs(before - value).max() <= _SETTLED * max(1.0, np.abs(value).max()) or monotonic() >= until:
                 break
         return value
 
-    def constant(self, u: int, start: Floats) -> Floats:
+    def constant(self, u: int, start: Floats, until: float) -> Floats:
         """Cost ``[n]`` of control ``u`` at all stages, from above; ``+inf`` where it becomes illegal some time."""
-        value = start
+        value = np.where(self._lasting(u), start, np.inf)
         for _ in range(_MOST_ROUNDS):
-            before, value = value, self._step(u, value)
-            if np.allclose(before, value, rtol=_SETTLED, atol=_SETTLED):
+            before, value = value, np.minimum(value, self._step(u, value))
+            if np.allclose(before, value, rtol=_SETTLED, atol=_SETTLED) or monotonic() >= until:
                 break
         return value
 
-    def informed(self) -> Floats:
+    def informed(self, until: float) -> Floats:
         r"""The fast informed bound ``[n, U]``: :math:`\min_u\sum_i b(i)Q(i,u)` is no more than the optimal cost of a belief.
 
         .. math:: Q(i,u)=g(i,u)+\alpha\sum_z\min_{u'}\sum_j p_{ij}(u)\,p(z\mid j,u)\,Q(j,u')
 
-        It is approached from below, so that stopping early gives a bound, too.
+        It is approached from below.
         """
         q = np.where(np.isfinite(self.cost.T), np.where(self.free[:, None], 0.0, self.lowest), np.inf)
         for _ in range(_MOST_ROUNDS):
-            before, q = q, np.stack([self._informed_step(u, q) for u in range(self.num_controls)], 1)
-            if np.allclose(before, q, rtol=_SETTLED, atol=_SETTLED):
+            steps = np.stack([self._informed_step(u, q) for u in range(self.num_controls)], 1)
+            before, q = q, np.maximum(q, steps)
+            if np.allclose(before, q, rtol=_SETTLED, atol=_SETTLED) or monotonic() >= until:
                 break
         return q
 
@@ -136,6 +146,15 @@ class JointTable:
         each = self.controls[u]
         by_pair = np.add.reduceat(each.p[:, None] * q[each.j], each.pairs, axis=0).min(1)
         return self.cost[u] + self.discount * np.add.reduceat(by_pair, each.pair_rows)
+
+    def _lasting(self, u: int) -> NDArray[np.bool_]:
+        """States ``[n]`` from where control ``u`` stays legal for ever."""
+        each, lasting = self.controls[u], np.isfinite(self.cost[u])
+        while True:
+            still = lasting & np.logical_and.reduceat(lasting[each.j], each.rows)
+            if (still == lasting).all():
+                return lasting
+            lasting = still
 
     def _free(self) -> NDArray[np.bool_]:
         legal = np.isfinite(self.cost)

@@ -22,6 +22,10 @@ ANY = -1
 
 # Beliefs that agree to so many digits are one.
 DIGITS = 14
+# Columns of vectors that are compared at once.
+_COLUMNS = 16
+# Rows without a use that are borne in any case.
+_SPARE = 256
 
 
 class _Rows:
@@ -37,6 +41,12 @@ class _Rows:
         self._all[self.count] = row
         self.count += 1
 
+    def keep(self, which: NDArray[np.bool_]) -> None:
+        """Drop all other rows."""
+        kept = self.rows[which]
+        self._all[: len(kept)] = kept
+        self.count = len(kept)
+
     @property
     def rows(self) -> NDArray:
         return self._all[: self.count]
@@ -46,9 +56,9 @@ class _Rows:
 class Node:
     """A belief, by the states of its support and their probabilities, with its bounds.
 
-    ``best`` is the vector of the upper bound; ``vectors`` and ``points`` say how many of each have been looked at. ``edges``
-    are, once it is expanded, for each control that may be best the stage cost and for each observation its number, probability
-    and next belief.
+    ``best`` is the vector of the upper bound, ``point`` the node's own point of the lower one, -1 for none; ``vectors`` and
+    ``points`` say how many of each have been looked at. ``edges`` are, once it is expanded, for each control that may be best
+    the stage cost and for each observation its number, probability and next belief.
     """
 
     states: Integers
@@ -58,6 +68,7 @@ class Node:
     lower: float
     upper: float = np.inf
     best: int = 0
+    point: int = -1
     vectors: int = 0
     points: int = 0
     edges: list[tuple[int, float, list[tuple[int, float, Node]]]] | None = None
@@ -71,31 +82,44 @@ class Node:
 class Search:
     """Bounds of the optimal cost at start beliefs, and the trials that tighten them.
 
+    Plans that cost no less than a later one in any state give way to it, and points of a belief to its later ones.
+
     Args:
         table: the model.
+        until: when the first bounds are left as they are.
 
     Attributes:
         vectors: costs of plans by state, ``[N, n]``; the first one is that of any legal policy.
         controls: first control of each plan.
         successors: for each plan the plans that it goes on with, by observation.
         largest_support: the most states that a belief was spread over.
+        top: a number that the least of the vectors that are kept exceeds at no belief.
+        bottom: the least number of all vectors and of the informed bound.
     """
 
-    def __init__(self, table: JointTable) -> None:
+    def __init__(self, table: JointTable, until: float) -> None:
         self.table = table
         n = table.num_states
-        self.informed = table.informed()
+        self.informed = table.informed(until)
         self.corner: Floats = self.informed.min(1)
         self.vectors = _Rows(n)
         self.controls: list[int] = []
         self.successors: list[Integers] = []
+        # For each vector the one that it gave way to, or itself, and whether it did not; which points are the latest of their
+        # beliefs.
+        self._instead: list[int] = []
+        self._alive = _Rows(1, np.bool_)
+        self._latest: list[bool] = []
+        self._beaten = self._outdated = 0
         self._inverse, self._bits, self._gain = _Rows(n), _Rows(-(-n // 8), np.uint8), _Rows(1)
         self._nodes: dict[bytes, Node] = {}
         self.largest_support = 0
-        worst = table.worst()
+        self.bottom = float(self.informed.min())
+        self._flattest, self.top = 0, np.inf
+        worst = table.worst(until)
         self._add_vector(ANY, worst, np.zeros(0, np.int64))
         for u in range(table.num_controls):
-            vector = table.constant(u, worst)
+            vector = table.constant(u, worst, until)
             if np.isfinite(vector).any():
                 self._add_vector(u, vector, np.full(1, self.vectors.count))
 
@@ -209,40 +233,99 @@ class Search:
         if q[number][1] < node.upper:
             chosen = np.zeros(self.table.num_observations, np.int64)
             for z, _, child in q[number][2]:
-                chosen[z] = child.best
+                chosen[z] = self._current(child.best)
             u = node.edges[number][0]
-            self._add_vector(u, self.table.backup(u, self.vectors.rows, chosen), chosen)
+            vector = self.table.backup(u, self.vectors.rows, chosen)
+            # By rounding it may be none the better.
+            if float(vector[node.states] @ node.probs) < node.upper:
+                self._add_vector(u, vector, chosen)
         self.refresh(node)
+        self._tidy()
+
+    # ---- what is kept ----------------------------------------------------------------------------------------------
 
     def kept(self) -> list[int]:
-        """Numbers of the vectors that are best somewhere and of those that they go on with, but for those that others beat.
+        """Numbers of the vectors that are best somewhere and of those that they go on with.
 
         What they are worth, the least of them at each belief, is then no less than what following them costs.
         """
         found: set[int] = set()
-        waiting = {0} | {node.best for node in self._nodes.values() if node.edges is not None}
-        while waiting:
+        waiting = {0, self._flattest} | {node.best for node in self._nodes.values() if node.edges is not None}
+        while waiting := {self._current(number) for number in waiting} - found:
             found |= waiting
-            waiting = {int(k) for number in waiting for k in self.successors[number]} - found
-        numbers = sorted(found, reverse=True)
-        rows, kept = self.vectors.rows[numbers], np.ones(len(numbers), bool)
-        for k, row in enumerate(rows):
-            kept[k] = False
-            kept[k] = not (kept & (rows <= row).all(1)).any()
-        return [number for number, keep in zip(numbers, kept, strict=True) if keep]
+            waiting = set(np.unique(np.concatenate([self.successors[number] for number in waiting])).tolist())
+        return sorted(found, reverse=True)
 
     def _add_vector(self, control: int, vector: Floats, successors: Integers) -> None:
+        number, left = self.vectors.count, np.flatnonzero(self._alive.rows)
+        for first in range(0, len(vector), _COLUMNS):
+            part = slice(first, first + _COLUMNS)
+            left = left[(self.vectors.rows[left, part] >= vector[part]).all(1)]
+        for beaten in left.tolist():
+            self._instead[beaten] = number
+        self._alive.rows[left] = False
+        self._beaten += len(left)
+        self._alive.append(np.ones(1, np.bool_))
         self.vectors.append(vector)
         self.controls.append(control)
         self.successors.append(successors)
+        self._instead.append(number)
+        self.bottom = min(self.bottom, float(vector.min()))
+        if vector.max() < self.top:
+            self._flattest, self.top = number, float(vector.max())
+
+    def _current(self, number: int) -> int:
+        """The vector that a vector gave way to, or itself."""
+        instead = self._instead
+        while instead[number] != number:
+            instead[number] = number = instead[instead[number]]
+        return number
 
     def _add_point(self, node: Node, lower: float) -> None:
         node.lower = lower
         inverse = np.full(self.table.num_states, np.inf)
         inverse[node.states] = 1.0 / node.probs
+        if node.point >= 0:
+            self._latest[node.point] = False
+            self._outdated += 1
+        node.point = self._bits.count
+        self._latest.append(True)
         self._inverse.append(inverse)
         self._bits.append(node.bits)
         self._gain.append(np.array([lower - node.corners]))
+
+    def _tidy(self) -> None:
+        """Drop vectors that gave way and points that are outdated, once there are more of them than of all else."""
+        fewest = max(_SPARE, len(self._nodes))
+        if self._beaten > max(fewest, self.vectors.count // 2):
+            self._drop_vectors()
+        if self._outdated > max(fewest, self._bits.count // 2):
+            self._drop_points()
+
+    def _drop_vectors(self) -> None:
+        current = [self._current(number) for number in range(self.vectors.count)]
+        keep = self._alive.rows[:, 0].copy()
+        # How many are kept of the first so many; of one that is kept that is its new number.
+        number = np.concatenate([[0], keep.cumsum()])
+        for node in self._nodes.values():
+            node.best, node.vectors = int(number[current[node.best]]), int(number[node.vectors])
+        self._flattest = int(number[current[self._flattest]])
+        self.vectors.keep(keep)
+        self._alive.keep(keep)
+        self.controls = [control for control, kept in zip(self.controls, keep, strict=True) if kept]
+        renamed = number[current]
+        self.successors = [renamed[each] for each, kept in zip(self.successors, keep, strict=True) if kept]
+        self._instead, self._beaten = list(range(self.vectors.count)), 0
+
+    def _drop_points(self) -> None:
+        keep = np.array(self._latest)
+        number = np.concatenate([[0], keep.cumsum()])
+        for node in self._nodes.values():
+            node.points = int(number[node.points])
+            node.point = -1 if node.point < 0 else int(number[node.point])
+        for rows in (self._inverse, self._bits, self._gain):
+            rows.keep(keep)
+        self._latest, self._outdated = [True] * self._bits.count, 0
 
 
 def _stuck(node: Node) -> ValueError:
