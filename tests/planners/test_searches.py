@@ -306,6 +306,25 @@ def test_costs_that_overflow_double_precision_are_refused():
         POMCP(model, None, simulations=200)(y)
 
 
+def test_large_costs_that_differ_a_little_decide(make):
+    # Control 0 costs 2 more, once, before 1e7 at every stage: in float32 the sums, about 1e8, are 8 apart.
+    move = torch.tensor([[0.0, 1.0], [0.0, 1.0]]).expand(2, 2, 2)
+    model = TabularModel(move, torch.ones(2, 2, 1), [[1e7 + 2.0, 1e7], [1e7, 1e7]], 0.9)
+    decided = make(model, Myopic(model), max_steps=400)(TensorDict({"belief": torch.tensor([[1.0, 0.0]])}, [1]))
+    assert decided["q_factors"].dtype == torch.float32
+    torch.testing.assert_close(decided["q_factors"], torch.full((1, 2), 1e8), rtol=1e-6, atol=0.0)
+    assert decided["action"].tolist() == [1]
+
+
+def test_a_long_search_is_cut_into_stretches_and_finds_the_same(make, line3, monkeypatch):
+    y = line3.start(torch.arange(2))
+    whole = make(line3.model, UrgencyRepair(line3.model))(y.clone())["q_factors"]
+    assert list(tree_search.Budget(250_000, None).stretches()) == [100_000, 100_000, 50_000]
+    monkeypatch.setattr(tree_search, "_STRETCH", 7)
+    assert max(tree_search.Budget(None, 0.1).stretches()) <= 7
+    assert torch.equal(make(line3.model, UrgencyRepair(line3.model))(y.clone())["q_factors"], whole)
+
+
 def test_any_seed_will_do(make, line3):
     for problem in (line3, make_problem("tiger")):
         y = problem.start(torch.arange(1))

@@ -104,7 +104,7 @@ class DESPOT(TreeSearch):
             lower and upper bound; the latter is the cost of a policy that has been found. They differ from those of the best
             policy's expected cost as the mean over K scenarios does.
         """
-        found = self._search(check_instance("y", y, TensorDictBase))
+        found = self._search(check_instance("y", y, TensorDictBase)).to(self.model.dtype)
         return found[..., -2], found[..., -1]
 
     def _decide(self, roots: Roots, number: int, found: NDArray[np.float64]) -> int:

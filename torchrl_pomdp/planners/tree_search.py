@@ -26,8 +26,8 @@ from torchrl_pomdp.stopping import check_stopped
 
 __all__ = ["Budget", "TreeSearch"]
 
-# Most simulations of a decision.
-_MOST = 10**9
+# Most simulations of a decision, and of a stretch, which nothing can interrupt.
+_MOST, _STRETCH = 10**9, 100_000
 
 
 class Budget:
@@ -56,9 +56,16 @@ class Budget:
         self.seconds = None if seconds is None else check_number("seconds", seconds, "(0, inf)")
 
     def stretches(self) -> Iterator[int]:
-        """Numbers of simulations to go on with, as many at a time as the time allows; the first one always."""
+        """Numbers of simulations to go on with, as many at a time as the time allows; the first one always.
+
+        None is so large that one could not stop in between.
+        """
         if self.seconds is None:
-            yield int(self.simulations or 0)
+            left = int(self.simulations or 0)
+            while left:
+                size = min(left, _STRETCH)
+                yield size
+                left -= size
             return
         begin, done, size = perf_counter(), 0, 1
         while done < _MOST:
@@ -69,7 +76,7 @@ class Budget:
             fitting = done * (self.seconds / elapsed - 1.0) / 2
             if fitting < 1.0 and elapsed >= self.seconds * (1.0 - 0.5 / done):
                 return
-            size = max(1, int(min(fitting, 4.0 * done)))
+            size = max(1, int(min(fitting, 4.0 * done, _STRETCH)))
 
 
 class TreeSearch(MakesItsOwn, TensorDictModuleBase):
@@ -144,17 +151,18 @@ class TreeSearch(MakesItsOwn, TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"``, int64 ``[*B]``, and ``"q_factors"``, ``[*B, U]``, infinite where a control was not tried."""
-        q = self._search(tensordict)[..., : self.model.num_controls]
-        nothing, terminal = torch.isinf(q).all(-1), self.model.is_terminal(tensordict)
+        found = self._search(tensordict)[..., : self.model.num_controls]
+        nothing, terminal = torch.isinf(found).all(-1), self.model.is_terminal(tensordict)
         if bool((nothing & ~terminal).any()):
             raise ValueError("q_factors must be finite, got inf for every control: the model's costs overflow")
         # Where nothing follows, whatever is legal is as good.
-        q = q.masked_fill(terminal.unsqueeze(-1) & self.model.action_mask(tensordict), 0.0)
-        return tensordict.set("q_factors", q).set("action", q.argmin(-1))
+        q = found.masked_fill(terminal.unsqueeze(-1) & self.model.action_mask(tensordict), 0.0)
+        # In the model's type large costs that differ may be equal.
+        return tensordict.set("q_factors", q.to(self.model.dtype)).set("action", q.argmin(-1))
 
     @torch.no_grad()
     def _search(self, y: TensorDictBase) -> Tensor:
-        """What the searches from states ``[*B]`` have found, ``[*B, U + E]``."""
+        """What the searches from states ``[*B]`` have found, float64 ``[*B, U + E]``, finite in the model's type, too."""
         self.model.check_state(y)
         if makeup(self.base_policy) != self._makeup:
             self._prepare_engine()
@@ -167,8 +175,8 @@ class TreeSearch(MakesItsOwn, TensorDictModuleBase):
                 self.simulated_steps += sum(steps)
         if not bool((found > -np.inf).all()):
             raise ValueError("q_factors must be finite, got nan or -inf: the model's costs overflow")
-        result = torch.from_numpy(found).to(self.model.dtype)
-        if bool(result.isinf().logical_xor(torch.from_numpy(found).isinf()).any()):
+        result = torch.from_numpy(found)
+        if bool(result.to(self.model.dtype).isinf().logical_xor(result.isinf()).any()):
             largest = np.abs(found[np.isfinite(found)]).max()
             raise ValueError(
                 f"q_factors must be finite as {self.model.dtype}, got {largest:g}: costs, or the regularisation, are too large"
