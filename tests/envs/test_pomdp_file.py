@@ -95,6 +95,29 @@ def test_states_that_no_action_leaves_or_charges_for_are_terminal():
     assert model.terminal.tolist() == [True, False, False]
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_terminal_state_may_be_left_by_rounding(dtype):
+    text = "discount: 0.9 values: cost states: 2 actions: 1 observations: 1 T: 0 : 0 0.5 0.5 T: 0 : 1 : 1 {} O: * uniform\n"
+    for stay in ("0.9999999", "0.9999999999999999", "1.0"):
+        model, _ = parse_pomdp(text.format(stay) + "R: 0 : 0 : * : * 1", dtype=dtype)
+        assert model.terminal.tolist() == [False, True]
+        assert model.transition.tolist() == [[[0.5, 0.5], [0.0, 1.0]]]
+
+
+def test_terminal_states_are_read_by_what_they_do(tmp_path):
+    ends, start = torch.eye(2).unsqueeze(0), FixedBelief(torch.tensor([1.0, 0.0]))
+    for terminal in (None, torch.tensor([False, True])):
+        model = TabularModel(ends, torch.ones(1, 2, 1), [[1.0, 0.0]], 0.9, terminal=terminal)
+        write_pomdp(tmp_path / "it.POMDP", model, start)
+        assert read_pomdp(tmp_path / "it.POMDP")[0].terminal.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("start", ["0", "00", "1", "1.0", "uniform"])
+def test_forms_of_start_in_the_only_state(start):
+    text = f"discount: 0.9 values: cost states: 1 actions: 1 observations: 1 start: {start} T: 0 identity O: 0 uniform"
+    assert parsed(text)[1].belief.tolist() == [1.0]
+
+
 def test_a_file_makes_a_problem():
     problem = Problem(*read_pomdp(DATA / "tiger.POMDP"), name="tiger")
     assert problem.model.cost.tolist() == [[1.0, 1.0], [100.0, -10.0], [-10.0, 100.0]]
@@ -286,7 +309,8 @@ def test_what_a_file_cannot_say_is_refused(tmp_path):
         (HEAD + "R: go : a : b\n 1 1e999", 7, "expected 2 values of observations, finite, got '1e999'"),
         (HEAD + "T: * identity", None, r"text: the row O: go : a, which is never given, must sum to 1, got 0"),
         (HEAD + BODY + "T: stop : b : a 0.25", 8, "the row T: stop : b must sum to 1, got 1.25"),
-        (HEAD + BODY + "R: * : * : * : * 1e300", None, "text: cost must be finite as torch.float32"),
+        (HEAD + BODY + "R: * : * : * : * 1e39", 8, r"expected a value of at most 3.4e\+38 in size, got '1e39'"),
+        (HEAD + "R: go : a : b\n1\n-1e39", 8, r"expected a value of at most 3.4e\+38 in size, got '-1e39'"),
         (
             HEAD.replace("a b", "100000").replace("go stop", "100"),
             6,

@@ -259,6 +259,48 @@ def test_terminal_states_that_are_left_or_cost_something_are_refused():
     ]
 
 
+@pytest.mark.parametrize("form", [lambda table: table, torch.Tensor.to_sparse])
+def test_terminal_states_may_be_left_by_rounding(form):
+    # Ten times 0.1 are a bit less than 1; a sum may leave a bit elsewhere.
+    tenths = sum([0.1] * 10)
+    transition = torch.tensor([[[0.5, 0.5, 0.0], [0.0, tenths, 0.0], [0.0, 1e-12, 1.0 - 1e-12]]], dtype=torch.float64)
+    terminal = torch.tensor([False, True, True])
+    model = make(form(transition), torch.ones(1, 3, 1), torch.zeros(1, 3), terminal=terminal)
+    assert model.terminal.tolist() == [False, True, True]
+    assert model.transition.to_dense().tolist() == [[[0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]
+    # Others stay as they are given.
+    plain = make(form(transition), torch.ones(1, 3, 1), torch.zeros(1, 3))
+    assert torch.equal(plain.transition.to_dense(), transition)
+
+
+def all_of(model):
+    return model.transition, model.observation, model.cost, model.legal, model.terminal
+
+
+@pytest.mark.parametrize("form", [lambda table: table, torch.Tensor.to_sparse])
+def test_what_is_written_into_arguments_later_changes_nothing(form):
+    transition, observation, cost = (part.double() for part in arrays(1, 2, 3, 2))
+    legal, terminal = torch.ones(3, 2, dtype=torch.bool), torch.zeros(3, dtype=torch.bool)
+    legal[0, 0], terminal[2] = False, True
+    transition[:, 2], cost[:, 2] = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.0
+    given = [form(transition), form(observation), cost, legal, terminal]
+    model = make(*given[:3], legal=legal, terminal=terminal)
+    before = [
+        each.to_dense().clone() for each in (model.transition, model.observation, model.cost, model.legal, model.terminal)
+    ]
+    for each in given:
+        (each._values() if each.is_sparse else each).zero_()
+    assert all(torch.equal(one, other.to_dense()) for one, other in zip(before, all_of(model), strict=True))
+    assert float(before[2].abs().sum()) > 0
+
+
+@pytest.mark.parametrize("form", [lambda table: table, torch.Tensor.to_sparse])
+def test_tables_keep_no_gradients(form):
+    given = [form(part).requires_grad_() for part in arrays(1, 2, 3, 2)[:2]]
+    model = make(*given, arrays(1, 2, 3, 2)[2].requires_grad_())
+    assert not any(each.requires_grad for each in (model.transition, model.observation, model.cost))
+
+
 # ---- names, refusals ---------------------------------------------------------------------------------------------------
 
 

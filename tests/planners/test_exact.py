@@ -368,6 +368,18 @@ def test_vectors_that_differ_by_more_than_rounding_do_not():
     assert policy(FixedBelief(torch.tensor([0.5, 0.5]))(torch.arange(3)))["action"].tolist() == [1, 1, 1]
 
 
+def test_what_is_written_into_vectors_and_controls_later_changes_nothing():
+    vectors, controls = torch.tensor([[4.0, 9.0], [9.0, 1.0]], dtype=torch.float64), torch.tensor([2, 1])
+    policy = AlphaVectorPolicy(tiger().model, vectors.requires_grad_(), controls)
+    with torch.no_grad():
+        vectors.zero_()
+    controls.zero_()
+    y = TensorDict({"belief": torch.eye(2)}, [2])
+    assert policy(y)["action"].tolist() == [2, 1]
+    assert policy.cost(y).tolist() == [4.0, 1.0]
+    assert not policy.cost(y).requires_grad
+
+
 def test_a_belief_without_a_legal_plan_is_refused():
     policy = AlphaVectorPolicy(tiger().model, torch.tensor([[1.0, torch.inf]]), torch.tensor([0]))
     with pytest.raises(ValueError, match="y has a belief at which no plan is legal"):

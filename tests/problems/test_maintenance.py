@@ -219,3 +219,14 @@ def test_wrong_numbers_are_named():
         PeriodicInspection(maintenance(1).model, 0, 1)
     with pytest.raises(ValueError, match=r"failed must be in \[0, 1\]"):
         RandomWear(maintenance(1).model, failed=1.5)
+
+
+def test_what_is_written_into_a_chain_later_changes_nothing():
+    chain = torch.tensor([[0.9, 0.1], [0.0, 1.0]], requires_grad=True)
+    part = Component(3.0, 1.0, 0.0, 1.0, chain)
+    with torch.no_grad():
+        chain.fill_(0.5)
+    assert torch.equal(part.chain, torch.tensor([[0.9, 0.1], [0.0, 1.0]]))
+    model = MaintenanceModel([part], 1, penalty=1.0)
+    assert model.chain.tolist() == [[pytest.approx([0.9, 0.1]), [0.0, 1.0]]]
+    assert not model.chain.requires_grad

@@ -99,7 +99,7 @@ def parse_pomdp(
         ([[-3.0, 0.0], [1.0, 1.0]], [[1.0, 0.0], [1.0, 0.0]])
     """
     dtype, device = check_dtype("dtype", dtype), check_device("device", device)
-    parser = Parser(check_instance("text", text, str), check_text("name", name))
+    parser = Parser(check_instance("text", text, str), check_text("name", name), torch.finfo(dtype).max)
     u, n, z = parser.controls.count, parser.states.count, parser.observations.count
     moves, sees = parser.moves.result(), parser.sees.result()
     _check_rows(parser, "T", parser.moves, moves)
@@ -128,8 +128,9 @@ def parse_pomdp(
 def write_pomdp(path: str | PathLike[str], model: TabularModel, start: FixedBelief) -> None:
     """Write a model and its start belief as a ``.POMDP`` file, whole or not at all.
 
-    What :func:`read_pomdp` gives for it in the same type is equal to the last bit. In names, hyphens stand for the
-    characters that names in such files do not have; partitions are not written.
+    What :func:`read_pomdp` gives for it in the same type is equal to the last bit. Only, such files have no word for terminal
+    states: all that no control leaves or charges for are read as such, whether the model says so or not, and as certain to
+    stay. In names, hyphens stand for the characters that names in such files do not have; partitions are not written.
 
     Args:
         path: the file to make or replace.

@@ -99,6 +99,7 @@ class Parser:
     Args:
         text: what a file holds.
         name: name of the file, for messages.
+        largest: the largest size of a value of R.
 
     Attributes:
         name: name of the file.
@@ -115,7 +116,7 @@ class Parser:
 
     Examples:
         >>> text = "discount: 0.9 values: cost states: 2 actions: stay observations: 1 T: stay identity O: stay uniform"
-        >>> parser = Parser(text, "example")
+        >>> parser = Parser(text, "example", 1e9)
         >>> parser.states.count, parser.controls.names, parser.start.tolist()
         (2, ('stay',), [0.5, 0.5])
     """
@@ -127,8 +128,8 @@ class Parser:
     sees: Rows
     rewards: Rewards
 
-    def __init__(self, text: str, name: str) -> None:
-        self.name = name
+    def __init__(self, text: str, name: str, largest: float) -> None:
+        self.name, self._largest = name, largest
         self._words = _Words(text, name)
         self._given: dict[str, int] = {}
         self._ready = False
@@ -219,7 +220,9 @@ class Parser:
         self._colon()
         # A number without another one behind it is a state, not a list of probabilities.
         behind = words.all[min(words.at + 1, len(words.all) - 1)]
-        single = not _NUMBER.fullmatch(words.next) or (n > 1 and not _NUMBER.fullmatch(behind))
+        number = _NUMBER.fullmatch(words.next)
+        # The only state has the number 0, which is no probability to start in it.
+        single = not number or (words.next.strip("0") == "" if n == 1 else not _NUMBER.fullmatch(behind))
         if words.next == "uniform":
             words.take()
             self.start = np.full(n, 1.0 / n)
@@ -292,12 +295,20 @@ class Parser:
         n, z = self.states.count, self.observations.count
         if len(where) == 1:
             self._words.expect("a colon and a state")
+        at = self._words.at
         if len(where) == 4:
-            self.rewards.put(where, self._number("a finite number"))
+            values = np.array([self._number("a finite number")])
         elif len(where) == 3:
-            self.rewards.put_block(where, self._numbers(z, "values of observations"))
+            values = self._numbers(z, "values of observations")
         else:
-            self.rewards.put_block(where, self._numbers(n * z, "values of next states and observations").reshape(n, z))
+            values = self._numbers(n * z, "values of next states and observations")
+        large = (np.abs(values) > self._largest).nonzero()[0]
+        if len(large):
+            self._words.expect(f"a value of at most {self._largest:.3g} in size", at + int(large[0]))
+        if len(where) == 4:
+            self.rewards.put(where, float(values[0]))
+        else:
+            self.rewards.put_block(where, values if len(where) == 3 else values.reshape(n, z))
 
     # ---- words -------------------------------------------------------------------------------------------------------
 

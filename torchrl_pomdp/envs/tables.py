@@ -92,6 +92,12 @@ class DenseTable(nn.Module):
         """Probabilities of staying in a state, ``[U, n]``."""
         return self.rows.diagonal(dim1=1, dim2=2)
 
+    def kept(self, states: Tensor) -> DenseTable:
+        """The table where some states, bool ``[n]``, are never left by controls that hardly do; of ``[U, n, n]``."""
+        stay = _hardly_left(self.diagonal(), states).unsqueeze(-1)
+        rows = torch.where(stay, torch.eye(self.shape[1], dtype=self.rows.dtype, device=self.rows.device), self.rows)
+        return DenseTable(rows, rows.dtype, rows.device)
+
     def given(self) -> Tensor:
         """The table in the form in which it was given, ``[U, n, m]``."""
         return self.rows
@@ -189,6 +195,14 @@ class SparseTable(nn.Module):
         result[self._controls()[stay], self.row[stay]] = self.values[stay]
         return result
 
+    def kept(self, states: Tensor) -> SparseTable:
+        """The table where some states, bool ``[n]``, are never left by controls that hardly do; of ``[U, n, n]``."""
+        control, same = self._controls(), self.row == self.col
+        stay = _hardly_left(self.diagonal(), states)[control, self.row]
+        index, values = torch.stack([control, self.row, self.col]), self.values.masked_fill(stay, 1.0)
+        left = ~stay | same
+        return SparseTable(self.shape, index[:, left], values[left], values.dtype, values.device)
+
     def _controls(self) -> Tensor:
         count = torch.tensor(self._ends, device=self.row.device).diff()
         return torch.arange(len(count), device=self.row.device).repeat_interleave(count)
@@ -228,7 +242,7 @@ def table(
         return _sparse(name, rows.detach().cpu(), dtype, device)
     if rows.layout != torch.strided:
         raise TypeError(f"{name} must be dense or sparse in COO layout, got {rows.layout}")
-    rows = rows.double()
+    rows = rows.detach().double()
     sums = rows.sum(-1, keepdim=True)
     _check_rows(name, rows.amin(-1), sums.squeeze(-1))
     return DenseTable(torch.where(_off(sums, dtype), rows / sums, rows), dtype, device)
@@ -262,6 +276,11 @@ def _check_rows(name: str, least: Tensor, sums: Tensor) -> None:
 def _off(sums: Tensor, dtype: torch.dtype) -> Tensor:
     """Which rows are to be scaled: their sum is off by more than rounding."""
     return (sums - 1.0).abs() > ROUNDING[dtype]
+
+
+def _hardly_left(diagonal: Tensor, states: Tensor) -> Tensor:
+    """Which states, bool ``[U, n]``, of some ``[n]`` each control leaves by no more than rounding."""
+    return states & (diagonal >= 1.0 - ROUNDING[diagonal.dtype])
 
 
 def _products(rows: Tensor, planes: Tensor, block: slice) -> Tensor:

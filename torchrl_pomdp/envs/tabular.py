@@ -43,7 +43,7 @@ class TabularModel(BeliefModel):
     Keyword Args:
         legal: bool ``[n, U]``, the controls that are legal in each state, at least one; None: all. Tables hold
             distributions and finite costs at illegal ones too.
-        terminal: bool ``[n]``, states that are never left and from which no cost follows; None: none.
+        terminal: bool ``[n]``, states that are never left, up to rounding, and from which no cost follows; None: none.
         state_names: names of the states.
         control_names: names of the controls.
         observation_names: names of the observations.
@@ -100,6 +100,9 @@ class TabularModel(BeliefModel):
         self.num_controls, self.num_states, _ = self._moves.shape
         self._sees = table("observation", observation, dtype, device, self._moves.shape[:2])
         self.num_observations = self._sees.shape[-1]
+        if terminal is not None:
+            terminal = check_tensor("terminal", terminal, (self.num_states,), torch.bool, finite=False).to(device)
+            self._moves = self._moves.kept(terminal)
         expected = self._expected(check_tensor("cost", cost, finite=False), dtype)
         self.register_buffer("cost", expected.to(device), persistent=False)
         self._register_legal(legal)
@@ -113,7 +116,7 @@ class TabularModel(BeliefModel):
         """The expected stage costs ``[U, n]`` on the CPU."""
         num_controls, n, num_observations = self.num_controls, self.num_states, self.num_observations
         shapes = [(num_controls, n, n, num_observations)[:dims] for dims in (2, 3, 4)]
-        cost = cost.detach().cpu().to(dtype)
+        cost = cost.detach().cpu().to(dtype, copy=True)
         if tuple(cost.shape) not in shapes or not bool(torch.isfinite(cost).all()):
             allowed = ", ".join(str(list(shape)) for shape in shapes)
             raise ValueError(f"cost must be finite as {dtype}, of one of the shapes {allowed}, got {tuple(cost.shape)}")
@@ -139,10 +142,9 @@ class TabularModel(BeliefModel):
             illegal = None if bool(legal.all()) else (~legal).to(self.device, torch.float32)
         self.register_buffer("illegal", illegal, persistent=False)
 
-    def _register_terminal(self, terminal: Any) -> None:
+    def _register_terminal(self, terminal: Tensor | None) -> None:
         going = None
         if terminal is not None:
-            terminal = check_tensor("terminal", terminal, (self.num_states,), torch.bool, finite=False).to(self.device)
             wrong = (self.legal.T & terminal & ((self._moves.diagonal() < 1.0) | (self.cost != 0.0))).nonzero()
             if len(wrong):
                 u, state = wrong[0].tolist()

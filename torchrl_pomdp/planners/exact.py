@@ -83,7 +83,7 @@ class AlphaVectorPolicy(TensorDictModuleBase):
         super().__init__()
         self.model = check_instance("model", model, TabularModel)
         self.in_keys = list(model.state_keys)
-        vectors = check_tensor("vectors", vectors, (None, model.num_states), finite=False).double()
+        vectors = check_tensor("vectors", vectors, (None, model.num_states), finite=False).detach().double()
         if not len(vectors) or bool((vectors.isnan() | (vectors == -torch.inf)).any()):
             raise ValueError("vectors must hold at least one vector of numbers and +inf, no NaN and no -inf")
         controls = check_tensor("controls", controls, (len(vectors),), torch.int64)
@@ -91,7 +91,7 @@ class AlphaVectorPolicy(TensorDictModuleBase):
             raise ValueError(f"controls must be in -1..{model.num_controls - 1}, got {controls.tolist()}")
         self.register_buffer("_costs", vectors.nan_to_num(posinf=0.0).T.to(model.device), persistent=False)
         self.register_buffer("_illegal", vectors.isinf().T.float().to(model.device), persistent=False)
-        self.register_buffer("controls", controls.to(model.device), persistent=False)
+        self.register_buffer("controls", controls.to(model.device, copy=True), persistent=False)
         self._equal = _tolerance(model.discount, model.num_states)
 
     def __len__(self) -> int:

@@ -51,6 +51,9 @@ class Component:
         for name, interval in {"replacement_cost": "[0, inf)", "inspection_cost": "[0, inf)", "success": "[0, 1]"}.items():
             check_number(name, getattr(self, name), interval)
         check_number("accuracy", self.accuracy, "[0, 1]")
+        if isinstance(self.chain, Tensor):
+            # What is written into the tensor later is none of the component's.
+            object.__setattr__(self, "chain", self.chain.detach().clone())
 
     def inspection(self, levels: int) -> Tensor:
         """P(level shown | level), ``[K, K]``: a neighbour that works takes what the accuracy leaves, two of them half each."""
