@@ -139,6 +139,12 @@ def test_the_command(tmp_path, capsys):
     assert (tmp_path / "bounds.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_the_command_refuses_in_one_line(capsys):
+    assert main(["--models", "0"]) == 2
+    out, err = capsys.readouterr()
+    assert (out, err) == ("", "python -m torchrl_pomdp.bounds: models must be at least 1, got 0\n")
+
+
 def test_the_beliefs_of_random_problems_are_hidden_states():
     sizes, hidden = [], 0
     for seed in range(20):

@@ -254,18 +254,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: those of the command; None: of the process.
 
     Returns:
-        0 if both inequalities held everywhere, else 1.
+        0 if both inequalities held everywhere, 1 if not, 2 for input that was refused.
     """
     parser = argparse.ArgumentParser(prog="python -m torchrl_pomdp.bounds", description="Proposition 1 on random problems")
     parser.add_argument("--models", type=int, default=500, help="how many problems")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first one")
     parser.add_argument("--figure", type=Path, help="file .png of a picture")
     given = parser.parse_args(arguments)
-    results = random_bounds(given.models, seed=given.seed)
-    broken = [found for found in results if not found.hold]
-    sys.stdout.write(f"{looseness(results)}\n{len(results)} evaluations, {len(broken)} violations\n")
-    if given.figure is not None:
-        sys.stdout.write(draw({given.figure: lambda: bounds_figure(results)}) + "\n")
+    try:
+        results = random_bounds(given.models, seed=given.seed)
+        broken = [found for found in results if not found.hold]
+        sys.stdout.write(f"{looseness(results)}\n{len(results)} evaluations, {len(broken)} violations\n")
+        if given.figure is not None:
+            sys.stdout.write(draw({given.figure: lambda: bounds_figure(results)}) + "\n")
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"{parser.prog}: {' '.join(str(error).split())}\n")
+        return 2
     return 1 if broken else 0
 
 

@@ -219,6 +219,11 @@ def test_wrong_numbers_are_named():
         PeriodicInspection(maintenance(1).model, 0, 1)
     with pytest.raises(ValueError, match=r"failed must be in \[0, 1\]"):
         RandomWear(maintenance(1).model, failed=1.5)
+    with pytest.raises(ValueError, match=r"failed and new must add up to at most 1, got 0.8 and 0.8"):
+        RandomWear(maintenance(1).model, failed=0.8, new=0.8)
+    bulb = Component(3.0, 1.0, 0.0, 1.0, [[0.9, 0.1], [0.0, 1.0]])
+    with pytest.raises(ValueError, match=r"components must have at most 1048576 joint controls.* got 3\^22 controls and 2\^22"):
+        MaintenanceModel([bulb] * 22, 1, penalty=1.0)
 
 
 def test_what_is_written_into_a_chain_later_changes_nothing():

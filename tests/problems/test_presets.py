@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_pomdp.problems import PRESETS, make_problem, problem_from_spec
+from torchrl_pomdp.problems import PRESETS, make_problem, problem_from_spec, rocksample
 
 # States, controls, observations and the model's own description of them.
 SIZES = {
@@ -55,6 +55,18 @@ def test_training_states_lie_in_their_parts_and_starts_are_startgame(name):
 def test_unknown_presets_are_refused():
     with pytest.raises(ValueError, match="unknown preset 'line4'; do you mean line3\\?; known presets: crying_baby, grid5x4"):
         make_problem("line4")
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "value"),
+    [("rocksample7x8", "n", 3), ("rocksample11x11", "k", 2), ("maintenance3", "k", 1), ("linear20_uneven", "uneven", False)],
+)
+def test_options_that_a_name_says_are_refused(name, option, value):
+    with pytest.raises(TypeError, match=f"{name} takes no option {option}, which its name says; got {value}"):
+        make_problem(name, **{option: value})
+    with pytest.raises(ValueError, match=option):
+        problem_from_spec({"preset": name, option: value})
+    assert make_problem("rocksample15x15", seed=3).model.rocks == rocksample(15, 15, seed=3).model.rocks
 
 
 def test_extensions_are_described_by_plain_json():

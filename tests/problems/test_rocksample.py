@@ -169,6 +169,8 @@ def test_wrong_rocks_are_named():
         RockSample(3, [(0, 0, 1)])
     with pytest.raises(ValueError, match="k must be at most 9, got 10"):
         rocksample(3, 10)
+    with pytest.raises(ValueError, match=r"at most 16777216, got a size of 1000 and 1000 rocks"):
+        rocksample(1000, 1000)
 
 
 def test_the_nearest_rock_by_hand():

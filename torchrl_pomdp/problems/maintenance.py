@@ -151,7 +151,7 @@ class RandomWear:
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if a probability is out of range.
+        ValueError: if a probability is out of range, or they add up to more than 1.
 
     Examples:
         >>> y = RandomWear(maintenance(1).model)(torch.arange(1000))
@@ -162,6 +162,9 @@ class RandomWear:
     def __init__(self, model: MaintenanceModel, failed: float = 0.2, new: float = 0.2) -> None:
         self.model = check_instance("model", model, MaintenanceModel)
         self.failed, self.new = check_number("failed", failed, "[0, 1]"), check_number("new", new, "[0, 1]")
+        # Decimal shares of 1 may add up to a bit more.
+        if self.failed + self.new > 1.0 + 1e-9:
+            raise ValueError(f"failed and new must add up to at most 1, got {self.failed} and {self.new}")
 
     def __call__(self, keys: Tensor) -> TensorDictBase:
         """Feature states ``[*B]`` (core entries) for int64 keys ``[*B]``."""

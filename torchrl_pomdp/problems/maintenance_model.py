@@ -27,6 +27,8 @@ from torchrl_pomdp.tensor_checks import check_device, check_distributions, check
 __all__ = ["INSPECT", "NOTHING", "REPLACE", "Component", "MaintenanceModel"]
 
 NOTHING, REPLACE, INSPECT = range(3)
+# Most controls, and most observations: all are numbered.
+_MOST = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,8 @@ class MaintenanceModel(BeliefModel):
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if there is no component, their chains do not fit together, or a number is out of range.
+        ValueError: if there is no component, their chains do not fit together, there are more than a million controls or
+            observations, or a number is out of range.
 
     Examples:
         >>> bulb = Component(3.0, 1.0, 0.0, 1.0, [[0.9, 0.1], [0.0, 1.0]])
@@ -131,6 +134,9 @@ class MaintenanceModel(BeliefModel):
         chain = _chains(components)
         self.num_levels = chain.shape[-1]
         self.num_controls, self.num_observations = 3**self.num_components, self.num_levels**self.num_components
+        if max(self.num_controls, self.num_observations) > _MOST:
+            sizes = f"3^{self.num_components} controls and {self.num_levels}^{self.num_components} observations"
+            raise ValueError(f"components must have at most {_MOST} joint controls, and as many observations, got {sizes}")
         prices = torch.tensor([[0.0, part.replacement_cost, part.inspection_cost] for part in components], dtype=torch.float64)
         self.max_cost = float(prices.amax(-1).sum()) + self.penalty
         inspection = torch.stack([part.inspection(self.num_levels) for part in components])

@@ -18,7 +18,7 @@ from torchrl_pomdp.problems.repair import REPAIR_PRESETS
 from torchrl_pomdp.problems.rocksample import rocksample
 from torchrl_pomdp.tensor_checks import check_device
 
-__all__ = ["PRESETS", "make_problem"]
+__all__ = ["PRESETS", "fixed_options", "make_problem"]
 
 PRESETS: dict[str, Callable[..., Problem]] = {
     **REPAIR_PRESETS,
@@ -30,6 +30,17 @@ PRESETS: dict[str, Callable[..., Problem]] = {
 """The known problems: functions that make them from keyword arguments, ``name`` and ``device`` among them."""
 
 
+def fixed_options(name: str) -> list[str]:
+    """What the name of a preset says, and options therefore cannot.
+
+    Examples:
+        >>> fixed_options("maintenance3"), fixed_options("tiger")
+        (['k'], [])
+    """
+    preset = PRESETS[name]
+    return list(preset.keywords) if isinstance(preset, partial) else []
+
+
 def make_problem(name: str, *, partitioned: bool = True, device: torch.device | str = "cpu", **options: Any) -> Problem:
     """Build a problem by name.
 
@@ -39,7 +50,7 @@ def make_problem(name: str, *, partitioned: bool = True, device: torch.device | 
     Keyword Args:
         partitioned: whether the model has the problem's parts, or a single one, see :meth:`Problem.unpartitioned`.
         device: where the model computes.
-        options: what else the problem's own function takes.
+        options: what else the problem's own function takes, but for what the name says.
 
     Raises:
         TypeError: if an argument is of the wrong kind, or the problem takes no such option.
@@ -58,5 +69,7 @@ def make_problem(name: str, *, partitioned: bool = True, device: torch.device | 
         known, close = ", ".join(sorted(PRESETS)), get_close_matches(name, PRESETS, 1)
         hint = f"; do you mean {close[0]}?" if close else ""
         raise ValueError(f"name must be that of a problem: unknown preset {shown(name)}{hint}; known presets: {known}")
+    if fixed := [option for option in fixed_options(name) if option in options]:
+        raise TypeError(f"{name} takes no option {fixed[0]}, which its name says; got {shown(options[fixed[0]])}")
     problem = replace(PRESETS[name](name=name, device=device, **options), spec={"preset": name, **options})
     return problem if partitioned else problem.unpartitioned()

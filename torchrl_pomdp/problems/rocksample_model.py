@@ -27,6 +27,8 @@ DISCOUNT, REWARD, HALVING_DISTANCE = 0.95, 10.0, 20.0
 # The controls before the checks; a check of rock i is FIRST_CHECK + i.
 NORTH, SOUTH, EAST, WEST, SAMPLE, FIRST_CHECK = range(6)
 NONE, GOOD, BAD = range(3)
+# Most numbers of a table by cell and control.
+_MOST = 1 << 24
 
 
 class RockSample(BeliefModel):
@@ -49,7 +51,8 @@ class RockSample(BeliefModel):
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if there is no rock, a rock lies outside the map or two share a cell.
+        ValueError: if there is no rock, a rock lies outside the map or two share a cell, or there are too many cells and
+            rocks for a table.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -88,6 +91,9 @@ class RockSample(BeliefModel):
         dtype, device = check_dtype("dtype", dtype), check_device("device", device)
         self.num_rocks, self.exit = len(self.rocks), self.size**2
         self.num_controls = FIRST_CHECK + self.num_rocks
+        if (self.exit + 1) * self.num_controls > _MOST:
+            allowed = f"(size^2 + 1) (rocks + {FIRST_CHECK}) at most {_MOST}"
+            raise ValueError(f"size and rocks must have {allowed}, got a size of {size} and {self.num_rocks} rocks")
         names = [f"check rock {rock}" for rock in range(self.num_rocks)]
         self.control_names = ("north", "south", "east", "west", "sample", *names)
         for name, table in self._tables(dtype).items():

@@ -15,7 +15,7 @@ from torchrl_pomdp.envs.generators import FixedBelief
 from torchrl_pomdp.envs.partition import SinglePart
 from torchrl_pomdp.envs.pomdp_file import parse_pomdp
 from torchrl_pomdp.envs.tabular import TabularModel
-from torchrl_pomdp.problems.presets import PRESETS, make_problem
+from torchrl_pomdp.problems.presets import PRESETS, fixed_options, make_problem
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.problems.repair import GRAPHS, STARTS, chain_of, repair_problem
 from torchrl_pomdp.tensor_checks import check_device
@@ -159,7 +159,8 @@ def _preset(value: Any, options: Mapping[str, Any], device: torch.device) -> Pro
     if not isinstance(value, str) or value not in PRESETS:
         raise SpecError(("preset",), f"must be one of {', '.join(sorted(PRESETS))}, got {shown(value)}")
     # Of what the function takes, what a file can say.
-    takes = [key for key in inspect.signature(PRESETS[value]).parameters if key not in ("graph", "start", "name", "device")]
+    unsaid = {"graph", "start", "name", "device", *fixed_options(value)}
+    takes = [key for key in inspect.signature(PRESETS[value]).parameters if key not in unsaid]
     _check_options((), value, options, takes)
     try:
         return make_problem(value, device=device, **options)
