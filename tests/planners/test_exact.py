@@ -239,16 +239,27 @@ def test_what_later_plans_and_points_surpass_is_dropped():
     assert 2 <= len(search.kept()) <= 4
 
 
-def test_plans_that_are_kept_go_on_with_plans_that_are_kept():
-    model = renewal()
-    found = solve(model, torch.tensor([1.0, 0.0]), seconds=1.0)
-    costs, vectors = found.policy.cost, found.policy._costs.T
-    table = JointTable(model)
-    y = TensorDict({"belief": torch.eye(2, dtype=torch.float64)}, [2])
-    least = costs(y).numpy()
-    for u, vector in zip(found.policy.controls.tolist(), vectors.numpy(), strict=True):
+def test_plans_that_are_kept_go_on_with_plans_that_are_kept(monkeypatch):
+    dropped = []
+    for name in ("_drop_vectors", "_drop_points"):
+        drop = getattr(Search, name)
+        monkeypatch.setattr(Search, name, lambda search, drop=drop: (dropped.append(drop), drop(search)))
+    table = JointTable(tiger().model)
+    search = Search(table, inf)
+    root = search.start(np.array([0.5, 0.5]))
+    while root.gap > 2e-6:
+        search.trial(root, 0.5 * root.gap, inf)
+    assert len(set(dropped)) == 2
+    assert root.lower - 5e-7 <= -19.371368 <= root.upper + 5e-7
+    kept = search.kept()
+    for number in kept:
+        u, successors = search.controls[number], [search._current(k) for k in search.successors[number]]
+        assert set(successors) <= set(kept)
         if u >= 0:
-            assert (table._step(u, least) <= vector * (1 + 1e-12)).all()
+            # A constant plan has a single one.
+            chosen = np.array(successors * (1 if len(successors) > 1 else table.num_observations))
+            cost = table.backup(u, search.vectors.rows, chosen)
+            assert (cost <= search.vectors.rows[number] + 1e-12 * np.abs(cost)).all()
 
 
 @pytest.mark.parametrize("bound", ["worst", "constant", "informed"])
