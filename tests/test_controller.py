@@ -261,7 +261,6 @@ def test_a_state_in_a_file_gives_the_same_decisions(dtype):
         first.update(first.act().control, None)
 
 
-@pytest.mark.parametrize("online", [False, True])
 def test_a_model_that_no_text_can_tell_is_named():
     class Locked(RepairModel):
         def __init__(self, *args):
@@ -276,6 +275,7 @@ def test_a_model_that_no_text_can_tell_is_named():
             call()
 
 
+@pytest.mark.parametrize("online", [False, True])
 def test_a_checkpoint_becomes_a_controller(tmp_path, online):
     from torchrl_pomdp.config import PolicyIterationConfig
     from torchrl_pomdp.trainers.architecture import make_networks, make_values
