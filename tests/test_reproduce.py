@@ -33,6 +33,12 @@ def test_the_papers_settings_are_the_papers():
     }  # fmt: skip
 
 
+def test_all_policies_of_a_run_are_evaluated_on_the_experiments_states():
+    for name, states in (("optimum", 100_000), ("table1", 1000)):
+        for run in plan(EXPERIMENTS[name], "tuned", "greedy", 0.05, 0).values():
+            assert run.states == run.rollout_states == run.online_states == states
+
+
 def test_published_numbers_stand_beside_ours():
     cost = torch.tensor([5000.0, 6000.0])
     found = {"greedy": compare(cost, cost), "pAPI-NT 2": compare(0.9 * cost, cost)}

@@ -220,6 +220,7 @@ def plan(
                 base,
                 config,
                 states=experiment.states,
+                rollout_states=experiment.states,
                 online_states=experiment.states,
                 online_trajectories=_ONLINE_TRAJECTORIES.get(problem, 5 if settings == "tuned" else 10),
             )
