@@ -21,9 +21,11 @@ from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import (
     AsynchronousIteration,
+    PolicyIteration,
     PolicyIterationConfig,
     asynchronous,
     load_checkpoint,
+    make_networks,
     papi_nt,
     papi_t,
     parts,
@@ -77,6 +79,31 @@ def test_every_part_publishes_every_version(line3, recipe):
     with torch.no_grad():
         y = line3.model.with_features(line3.start(torch.arange(5)))
         assert iterations[-1].policy(y)["action"].shape == (5,)
+
+
+def test_parts_go_on_from_the_networks_of_a_base_policy_that_has_some(line3, tmp_path, monkeypatch):
+    """As where they wait for each other. Networks of other sizes than the configuration's tell these from new ones."""
+    base = make_networks(line3, replace(CONFIG, hidden=(5, 3)), 7).eval()
+    begun, training = {}, PolicyIteration._training
+
+    def seen(run, index, part, network, number):
+        begun[number, part] = weights(network)
+        return training(run, index, part, network, number)
+
+    monkeypatch.setattr(PolicyIteration, "_training", seen)
+
+    def carried_out():
+        run = asynchronously(line3, base=lambda model: base, config=replace(CONFIG, iterations=1), folder=tmp_path)
+        (iteration,) = run
+        return [weights(network) for network in iteration.policy.policies]
+
+    trained, given = carried_out(), [weights(network) for network in base.policies]
+    assert [begun[1, part] for part in range(6)] == given
+    assert not any(own == before for own, before in zip(trained, given, strict=True))
+    # What is kept is of those networks as well: nothing is trained again.
+    begun.clear()
+    assert carried_out() == trained
+    assert begun == {}
 
 
 def test_the_best_policy_is_one_that_was_accepted(line3):

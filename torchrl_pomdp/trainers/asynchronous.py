@@ -57,7 +57,7 @@ class Version:
 
 @dataclass(frozen=True)
 class _Networks:
-    """What a part has published; before it has, its base policy and the problem's pessimistic cost."""
+    """What a part has published; before it has, its own of the base policy and the problem's pessimistic cost."""
 
     policy: Any
     value: Any
@@ -161,9 +161,8 @@ class AsynchronousIteration:
     def _start(self) -> _Progress:
         run = self.run
         run._start()
-        base = _Networks(run.base_policy, run._scale)
-        parts = range(run.partition.num_parts)
-        state = _Progress([[base] for _ in parts], [_Labels() for _ in parts])
+        base = [_Networks(policy, run._scale) for policy in run._local(run.base_policy)]
+        state = _Progress([[own] for own in base], [_Labels() for _ in base])
         self.best, self.published = run.best, state.published
         return state
 

@@ -227,8 +227,7 @@ class PolicyIteration:
 
     def _iterate(self, number: int) -> tuple[list[Any], list[Any], dict[str, PartRecord]]:
         """The local policies and values after one iteration from the best policy."""
-        best = self.best
-        local = list(best.policies) if isinstance(best, PartitionedPolicy) else [best] * self.partition.num_parts
+        local = self._local(self.best)
         values: list[Any] = list(self._values)
         records: dict[str, PartRecord] = {}
         for index, step in enumerate(self.plan):
@@ -238,6 +237,10 @@ class PolicyIteration:
             for part, network in networks.items():
                 (local if isinstance(step, Improve) else values)[part] = network.eval()
         return local, values, records
+
+    def _local(self, policy: TensorDictModuleBase) -> list[Any]:
+        """The policy of each part."""
+        return list(policy.policies) if isinstance(policy, PartitionedPolicy) else [policy] * self.partition.num_parts
 
     def _name(self, number: int, index: int) -> str:
         """Name of a step of the plan in an iteration."""
