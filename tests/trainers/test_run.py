@@ -15,6 +15,7 @@ import torch
 
 from torchrl_pomdp import kept as kept_results
 from torchrl_pomdp.files import load_tensors, save_tensors
+from torchrl_pomdp.modules import PartitionedPolicy
 from torchrl_pomdp.modules.repair import UrgencyRepair
 from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import Checkpoint, PolicyIterationConfig, load_checkpoint, parts, policy_iteration
@@ -38,6 +39,16 @@ TINY = PolicyIterationConfig(
     validation_states=10,
 )
 RUN = TrainingRun(make_problem("line3"), "API", config=TINY, states=8, online_states=4, online_trajectories=1)
+
+
+class CountedUrgency(UrgencyRepair):
+    """A base policy of one's own."""
+
+    calls = 0
+
+    def forward(self, tensordict):
+        CountedUrgency.calls += 1
+        return super().forward(tensordict)
 
 
 class Killed(BaseException):
@@ -294,6 +305,34 @@ def test_base_policies_are_not_named_like_what_a_run_makes(line3, name):
     problem = replace(line3, base_policies={**line3.base_policies, name: line3.base_policies["urgency"]}, spec=None)
     with pytest.raises(ValueError, match="base_policies must have names that no policy of a run has"):
         TrainingRun(problem)
+
+
+@pytest.mark.parametrize("algorithm", ["API", "pAPI-NT"])
+def test_what_could_not_be_kept_is_refused_before_anything_is_computed(line3, tmp_path, algorithm):
+    def carried_out(base, **change):
+        problem = replace(line3, base_policies={**line3.base_policies, "mine": base}, **change)
+        run = replace(RUN, problem=problem, algorithm=algorithm, base="mine", rollout_states=0, online_states=0)
+        return run.carry_out(tmp_path / "run")
+
+    def networks(**change):
+        problem = line3.unpartitioned() if algorithm == "API" else line3
+        return make_networks(problem, replace(TINY, **change), seed=0)
+
+    with pytest.raises(ValueError, match=r"must have the base policies that its spec describes.*'mine'.*with spec=None"):
+        carried_out(CountedUrgency(line3.model))
+    with pytest.raises(
+        ValueError, match=r"config must have the sizes and the encoder of the networks of the base policy 'mine'"
+    ):
+        carried_out(networks(hidden=(5, 3)), spec=None)
+    with pytest.raises(
+        ValueError, match=r"config must have the sizes and the encoder of the networks of the base policy 'mine'"
+    ):
+        carried_out(networks(encoder="flat"), spec=None)
+    with pytest.raises(ValueError, match=r"base_policy must have [16] local policies, one for each part, got 2"):
+        carried_out(PartitionedPolicy(list(line3.base_policies.values())), spec=None)
+    assert CountedUrgency.calls == 0
+    assert not list(tmp_path.iterdir())
+    assert list(carried_out(networks(), spec=None)) == ["greedy", "urgency", "mine", f"{algorithm} 1"]
 
 
 def test_a_checkpoint_is_not_named_like_a_base_policy(line3):

@@ -130,6 +130,19 @@ class PartitionedPolicy(_Partitioned):
         return local_engine(list(self.policies), model, limits)
 
 
+def local_policies(name: str, policy: TensorDictModuleBase, num_parts: int) -> list[TensorDictModuleBase]:
+    """The policy of each part: of a partitioned policy the local ones, of any other itself.
+
+    Raises:
+        ValueError: if a partitioned policy, which ``name`` names, has other parts.
+    """
+    if not isinstance(policy, PartitionedPolicy):
+        return [policy] * num_parts
+    if len(policy.policies) != num_parts:
+        raise ValueError(f"{name} must have {num_parts} local policies, one for each part, got {len(policy.policies)}")
+    return list(policy.policies)
+
+
 class PartitionedValue(_Partitioned):
     r"""Global cost approximation :math:`\hat J` whose value at a state of :math:`Y_\nu` is the local one's (Section V).
 

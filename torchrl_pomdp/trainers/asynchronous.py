@@ -161,7 +161,7 @@ class AsynchronousIteration:
     def _start(self) -> _Progress:
         run = self.run
         run._start()
-        base = [_Networks(policy, run._scale) for policy in run._local(run.base_policy)]
+        base = [_Networks(policy, run._scale) for policy in run._base]
         state = _Progress([[own] for own in base], [_Labels() for _ in base])
         self.best, self.published = run.best, state.published
         return state

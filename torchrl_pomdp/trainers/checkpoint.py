@@ -136,12 +136,22 @@ def save_checkpoint(path: str | PathLike[str], checkpoint: Checkpoint) -> None:
         ValueError: if what is given could not be loaded again; nothing is written.
         OSError: if the file cannot be written.
     """
-    path = check_path("path", path)
+    write_bytes(check_path("path", path), checkpoint_bytes(checkpoint))
+
+
+def checkpoint_bytes(checkpoint: Checkpoint) -> bytes:
+    """What :func:`save_checkpoint` writes; it can be loaded again."""
     check_instance("checkpoint", checkpoint, Checkpoint)
     described = _described(checkpoint.problem)
+    base = _base_name(checkpoint.policy, checkpoint.problem)
+    if base is not None and base != _base_name(checkpoint.policy, described):
+        raise ValueError(
+            f"checkpoint.problem must have the base policies that its spec describes, got another one, {base!r}: "
+            "with spec=None it is kept by its content alone"
+        )
     saved = tensor_bytes(_content(checkpoint))
     try:
-        loaded = _parse(parse_tensors(saved, path), described, checkpoint.problem.model.device)
+        loaded = _parse(parse_tensors(saved, "checkpoint"), described, checkpoint.problem.model.device)
     except ValueError as error:
         raise ValueError(f"checkpoint could not be loaded again: {error}") from error
     for name in ("policy", "value"):
@@ -151,7 +161,7 @@ def save_checkpoint(path: str | PathLike[str], checkpoint: Checkpoint) -> None:
                 f"checkpoint.{name} must be what checkpoint.problem and checkpoint.config describe, "
                 f"got another {type(given).__name__}: it could not be loaded"
             )
-    write_bytes(path, saved)
+    return saved
 
 
 def load_checkpoint(

@@ -44,7 +44,7 @@ from torchrl_pomdp.modules import (
     as_policy,
 )
 from torchrl_pomdp.modules.networks import LocalNetwork
-from torchrl_pomdp.modules.rollout import check_policy
+from torchrl_pomdp.modules.partitioned import local_policies
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.objectives import ClassificationLoss, ValueLoss
 from torchrl_pomdp.problems.problem import Problem
@@ -117,9 +117,9 @@ class PolicyIteration:
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if the plan is empty or names a part that is none; when iterated,
-            if the folder holds a run that differs in the content of its problem, its configuration, plan or base policy, or
-            in the library's version.
+        ValueError: if the plan is empty or names a part that is none, or a partitioned base policy has not one policy for each
+            part; when iterated, if the folder holds a run that differs in the content of its problem, its configuration, plan
+            or base policy, or in the library's version.
         FileNotFoundError: when iterated, if the folder is deleted meanwhile.
 
     Examples:
@@ -149,7 +149,7 @@ class PolicyIteration:
         self.partition = check_instance("problem", problem, Problem).partition
         self.problem, self.config = problem, check_instance("config", config, PolicyIterationConfig)
         self.base_policy = as_policy(base_policy, problem.model, "base_policy")
-        check_policy("base_policy", self.base_policy, problem.model)
+        self._base = local_policies("base_policy", self.base_policy, self.partition.num_parts)
         self.plan = checked_plan(plan, problem)
         self.folder = None if folder is None else check_path("folder", folder)
         self.logger = None if logger is None else check_instance("logger", logger, Logger)
@@ -169,8 +169,8 @@ class PolicyIteration:
     def _encoder(self) -> Encoder:
         """What the policy networks share."""
         if self._multiagent:
-            return _shared_encoder(self.base_policy, AgentNetwork) or make_agent_encoder(self.problem, self.config)
-        return _shared_encoder(self.base_policy, PolicyNetwork) or make_encoder(self.problem, self.config)
+            return _shared_encoder(self._base, AgentNetwork) or make_agent_encoder(self.problem, self.config)
+        return _shared_encoder(self._base, PolicyNetwork) or make_encoder(self.problem, self.config)
 
     @cached_property
     def _value_encoder(self) -> Encoder:
@@ -227,7 +227,7 @@ class PolicyIteration:
 
     def _iterate(self, number: int) -> tuple[list[Any], list[Any], dict[str, PartRecord]]:
         """The local policies and values after one iteration from the best policy."""
-        local = self._local(self.best)
+        local = local_policies("best", self.best, self.partition.num_parts)
         values: list[Any] = list(self._values)
         records: dict[str, PartRecord] = {}
         for index, step in enumerate(self.plan):
@@ -237,10 +237,6 @@ class PolicyIteration:
             for part, network in networks.items():
                 (local if isinstance(step, Improve) else values)[part] = network.eval()
         return local, values, records
-
-    def _local(self, policy: TensorDictModuleBase) -> list[Any]:
-        """The policy of each part."""
-        return list(policy.policies) if isinstance(policy, PartitionedPolicy) else [policy] * self.partition.num_parts
 
     def _name(self, number: int, index: int) -> str:
         """Name of a step of the plan in an iteration."""
@@ -397,7 +393,6 @@ def judge(comparison: Comparison) -> tuple[bool, str]:
     )
 
 
-def _shared_encoder(policy: TensorDictModuleBase, kind: type[LocalNetwork]) -> Encoder | None:
-    """The encoder of a policy's networks of a kind, if it has any."""
-    local = policy.policies if isinstance(policy, PartitionedPolicy) else [policy]
+def _shared_encoder(local: Sequence[TensorDictModuleBase], kind: type[LocalNetwork]) -> Encoder | None:
+    """The encoder of the networks of a kind among local policies, if there are any."""
     return next((p.encoder for p in local if isinstance(p, kind)), None)

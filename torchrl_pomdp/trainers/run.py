@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.record import CSVLogger
@@ -22,13 +24,14 @@ from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import DamagedFileError, check_claimed, read_json, write_json
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
-from torchrl_pomdp.modules import PartitionedValue, Policy
+from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue, Policy
 from torchrl_pomdp.modules.multiagent import SCHEMES
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.report.run_folder import read_iterations
 from torchrl_pomdp.trainers.architecture import is_multiagent
 from torchrl_pomdp.trainers.asynchronous import AsynchronousIteration
-from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest, save_checkpoint
+from torchrl_pomdp.trainers.checkpoint import Checkpoint, checkpoint_bytes, open_run_folder, problem_digest, save_checkpoint
+from torchrl_pomdp.trainers.plan import Improve
 from torchrl_pomdp.trainers.policy_iteration import Iteration
 from torchrl_pomdp.trainers.recipes import api, multiagent_rollouts, papi_nt, papi_t, r_nt, r_t
 from torchrl_pomdp.workers import LOCAL, Workers
@@ -160,7 +163,9 @@ class TrainingRun:
 
         Raises:
             TypeError: if something is of the wrong kind.
-            ValueError: if the folder holds something else.
+            ValueError: if the folder holds something else, or what is trained could not be kept: the problem has a spec, but
+                not the base policies that this describes, or networks of the base policy are not of the sizes and the encoder
+                that ``config`` has.
             OSError: if the folder cannot be written, or was deleted while the run went on.
         """
         folder = check_path("folder", folder)
@@ -169,6 +174,7 @@ class TrainingRun:
         if on_labels is not None:
             check_callable("on_labels", on_labels)
         check_instance("workers", workers, Workers).check_device(self.problem.model.device)
+        _check_kept(self)
         identity = _identity(self)
         path = open_run_folder(folder, identity)
         execution = _Execution(self, self.problem, path, identity, progress, report, on_labels, workers)
@@ -232,8 +238,7 @@ class _Execution:
             workers=self.workers,
         )
         training = together if run.staleness is None else AsynchronousIteration(together, run.staleness)
-        untrained_value = PartitionedValue([self.problem.pessimistic_cost] * self.problem.partition.num_parts)
-        kept_best = untrained = Checkpoint(self.problem, run.config, run.algorithm, 0, base, untrained_value)
+        kept_best = untrained = _base_checkpoint(run)
         if not (self.folder / "best.pt").is_file():
             self._keep("best.pt", untrained)
         # What is known already, when a run is carried out again, does not become less meanwhile.
@@ -327,6 +332,36 @@ class _Execution:
         self.check_folder()
         keep(path, owner, {"policy": own, "costs": costs})
         return costs
+
+
+def _base_checkpoint(run: TrainingRun) -> Checkpoint:
+    """The base policy, the best one as long as no iteration was accepted."""
+    problem = run.problem
+    value = PartitionedValue([problem.pessimistic_cost] * problem.partition.num_parts)
+    return Checkpoint(problem, run.config, run.algorithm, 0, problem.base_policies[run.base], value)
+
+
+def _check_kept(run: TrainingRun) -> None:
+    """Raise unless the base policy and the networks of the first iteration can be kept, which would come out after hours."""
+    base = _base_checkpoint(run)
+    checkpoint_bytes(base)
+    training = ALGORITHMS[run.algorithm](run.problem, run.config, base.policy)
+    local = list(training._base)
+    for index, step in enumerate(training.plan):
+        for part in step.parts if isinstance(step, Improve) else ():
+            local[part] = training._initial(index, part, local, [], 1)
+    networks = copy.deepcopy(PartitionedPolicy(local)).eval()
+    # Weights change, as in training: those of the base policy would be kept by its name.
+    with torch.no_grad():
+        for weight in networks.parameters():
+            weight.add_(1.0)
+    try:
+        checkpoint_bytes(replace(base, iteration=1, policy=networks))
+    except ValueError as error:
+        raise ValueError(
+            f"config must have the sizes and the encoder of the networks of the base policy {run.base!r}, which are trained "
+            f"further, it has others: {error}"
+        ) from error
 
 
 def _identity(run: TrainingRun) -> dict[str, Any]:
