@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchrl_pomdp import cli, commands
-from torchrl_pomdp.evaluation import compare
+from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import PartitionedValue
 from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import make_problem
@@ -73,6 +73,20 @@ def test_states_come_in_blocks_that_do_not_matter(line3, tmp_path, monkeypatch):
     parts = compare_peers(line3, tmp_path / "parts", states=7, seconds=0.001)
     assert parts["greedy"].comparison == whole["greedy"].comparison
     assert len(list((tmp_path / "parts" / "greedy").glob("0*.pt"))) == 4
+
+
+def test_a_checkpoint_without_parts_is_of_the_problem_too(line3, tmp_path):
+    """That of API: it costs what it costs where it was trained."""
+    problem, config = line3.unpartitioned(), PolicyIterationConfig(hidden=(8, 5), value_hidden=(8,))
+    policy, value = make_networks(problem, config, 0).eval(), make_values(problem, config, 0).eval()
+    own = Checkpoint(problem, config, "API", 1, policy, value)
+    options = {"checkpoint": own, "methods": ["API 1", "API 1 + R-NT"], "states": 4, "seconds": 0.001, "seed": 3}
+    outcomes = compare_peers(line3, tmp_path, **options)
+    assert list(outcomes) == ["greedy", "API 1", "API 1 + R-NT"]
+    costs = discounted_costs(problem.model, policy, problem.start, num_states=4, seed=3, terminal_cost=problem.evaluation_cost)
+    assert list(outcomes["API 1"].costs) == costs.tolist()
+    bare = replace(own, policy=line3.base_policies["urgency"], iteration=0)
+    assert "R-T of urgency" not in peers._peers(line3, bare, 0.01)
 
 
 def test_only_the_original_mode_may_do_everything(line3):

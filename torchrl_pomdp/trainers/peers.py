@@ -43,6 +43,7 @@ from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import Policy, RolloutPolicy, ValueNetwork
+from torchrl_pomdp.modules.partitioned import local_policies
 from torchrl_pomdp.modules.threads import kept_threads
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.planners import DESPOT, POMCP
@@ -94,7 +95,7 @@ def compare_peers(
         folder: where results are kept; new, empty, or that of the same comparison.
 
     Keyword Args:
-        checkpoint: a trained policy of the problem; None: without one.
+        checkpoint: a trained policy of the problem, with its parts or with a single one; None: without one.
         ppo_steps: belief steps that PPO is trained for; None: without PPO.
         methods: names of the methods to compare with the baseline; None: all.
         states: start states.
@@ -129,7 +130,8 @@ def compare_peers(
     check_flag("progress", progress)
     if checkpoint is not None:
         check_instance("checkpoint", checkpoint, Checkpoint)
-        if problem_digest(checkpoint.problem) != problem_digest(problem):
+        # What API has trained does not know of parts.
+        if problem_digest(checkpoint.problem) not in map(problem_digest, (problem, problem.unpartitioned())):
             raise ValueError(f"checkpoint must be of the problem {problem.name}, got one of {checkpoint.problem.name}")
     if ppo_steps is not None:
         check_integer("ppo_steps", ppo_steps, BATCH, _MOST_STEPS)
@@ -169,11 +171,14 @@ def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> d
     peers[f"R-NT of {base_name}"] = _Peer(RolloutPolicy(model, base, **online))
     if checkpoint is not None:
         # Without value networks there is nothing to cut simulations by.
-        earlier = [part for stage in problem.partition.stages[:-1] for part in stage]
+        earlier = [part for stage in checkpoint.problem.partition.stages[:-1] for part in stage]
         if earlier and all(isinstance(checkpoint.value.values[part], ValueNetwork) for part in earlier):
             peers[f"R-T of {base_name}"] = _Peer(r_t(problem, base, checkpoint.value, **online))
-        peers[checkpoint.name] = _Peer(checkpoint.policy)
-        peers[f"{checkpoint.name} + R-NT"] = _Peer(RolloutPolicy(model, checkpoint.policy, **online))
+        policy = checkpoint.policy
+        if checkpoint.problem.partition.num_parts < problem.partition.num_parts:
+            (policy,) = local_policies("checkpoint.policy", policy, 1)
+        peers[checkpoint.name] = _Peer(policy)
+        peers[f"{checkpoint.name} + R-NT"] = _Peer(RolloutPolicy(model, policy, **online))
     everything = model.unrestricted()
     for search in (POMCP, DESPOT):
         name = search.__name__
