@@ -97,7 +97,7 @@ class Evaluate:
 @dataclass(frozen=True)
 class Compare:
     """Compare all methods on a problem: base policies, rollout, a trained policy, POMCP, DESPOT and PPO; the same command goes
-    on with an interrupted comparison.
+    on with an interrupted comparison. Results of another one are not written over: name another folder by --out.
     """
 
     problem: tyro.conf.Positional[str]

@@ -19,7 +19,8 @@ from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.envs.repair import RepairModel, save_animation, trajectory_figure
 from torchrl_pomdp.evaluation import Comparison, discounted_costs
 from torchrl_pomdp.evaluation import compare as compare_costs
-from torchrl_pomdp.files import check_folder, write_bytes, write_json
+from torchrl_pomdp.files import check_folder, read_json, write_bytes, write_json
+from torchrl_pomdp.identity import digest
 from torchrl_pomdp.modules import Policy
 from torchrl_pomdp.modules.rollout import MAX_STEPS
 from torchrl_pomdp.noise import fold, seed_keys
@@ -168,6 +169,9 @@ def compare(command: Compare) -> None:
     given = None if command.checkpoint is None else load_checkpoint(command.checkpoint, problem=problem)
     name = f"compare-{problem.name}-{command.seconds:g}s"
     runs, out = check_folder("runs", command.runs), check_folder("out", command.out) / "compare"
+    about = {**asdict(command), **{key: str(getattr(command, key)) for key in ("checkpoint", "runs", "out")}}
+    about |= {"methods": command.methods and list(command.methods), "policy": given and digest(given.policy)}
+    _check_same(out / f"{name}.json", about)
     outcomes = compare_peers(
         problem,
         runs / name,
@@ -181,15 +185,26 @@ def compare(command: Compare) -> None:
         progress=True,
     )
     text = f"{problem.name}, {command.states} start states, {command.seconds:g} s a decision\n\n{peer_table(outcomes)}"
-    content = {"command": {**asdict(command), **{key: str(getattr(command, key)) for key in ("checkpoint", "runs", "out")}}}
-    content |= {"provenance": provenance(), "outcomes": {method: each.to_dict() for method, each in outcomes.items()}}
-    write_json(out / f"{name}.json", content)
+    found = {method: each.to_dict() for method, each in outcomes.items()}
+    write_json(out / f"{name}.json", {"command": about, "provenance": provenance(), "outcomes": found})
     write_bytes(out / f"{name}.md", f"{text}\n".encode())
     print(f"\n{text}\n", flush=True)
     results = [Result(method, outcome.comparison) for method, outcome in outcomes.items()]
     title = f"{problem.name}, {command.states} start states"
     pictures = {out / f"{name}-time.png": partial(peer_figure, outcomes, title)}
     print(draw(pictures | {out / f"{name}.png": partial(cost_figure, results, title)}))
+
+
+def _check_same(path: Path, command: dict[str, Any]) -> None:
+    """Raise if a file holds the results of another comparison: they are not written over."""
+    if not path.is_file():
+        return
+    found = read_json(path).get("command")
+    given = {key: value for key, value in command.items() if key not in ("runs", "out")}
+    differing = [key for key in given if not isinstance(found, dict) or found.get(key) != given[key]]
+    if differing:
+        what = ", ".join(differing)
+        raise ValueError(f"out must be another folder: {path} holds another comparison, which differs in {what}")
 
 
 def changes(command: Changes) -> None:

@@ -175,6 +175,41 @@ def test_the_command_writes_table_and_pictures(line3, checkpoint, tmp_path, caps
     assert "pictures:" in shown
 
 
+def test_the_command_writes_over_no_other_results(line3, checkpoint, tmp_path, capsys, monkeypatch):
+    save_checkpoint(tmp_path / "best.pt", checkpoint)
+    monkeypatch.setattr(peers, "_peers", lambda problem, *_: {"greedy": peers._Peer(GreedyRepair(problem.model))})
+    path = tmp_path / "out/compare/compare-line3-0.001s.json"
+
+    def compared(*more, runs="runs", out="out", states=3):
+        command = ["compare", "line3", "--states", str(states), "--seconds", "0.001", "--runs", str(tmp_path / runs)]
+        return cli.main([*command, "--out", str(tmp_path / out), *more])
+
+    assert compared("--methods", "greedy") == 0
+    before = {file.name: file.read_bytes() for file in path.parent.iterdir()}
+    others = {
+        "states": {"states": 4, "runs": "more"},
+        "seed": {"more": ("--seed", "5"), "runs": "more"},
+        "checkpoint, policy": {"more": ("--checkpoint", str(tmp_path / "best.pt"))},
+    }
+    for name, options in others.items():
+        assert compared("--methods", "greedy", *options.pop("more", ()), **options) == 2
+        assert f"{path} holds another comparison, which differs in {name}\n" in capsys.readouterr().err
+    assert compared() == 2
+    assert "differs in methods\n" in capsys.readouterr().err
+    assert {file.name: file.read_bytes() for file in path.parent.iterdir()} == before
+    assert not (tmp_path / "more").exists()
+    # The same one again, from wherever, and another one elsewhere.
+    assert compared("--methods", "greedy", runs="more") == 0
+    assert (
+        json.loads(path.read_bytes())["outcomes"]["greedy"]["costs"]
+        == json.loads(before[path.name])["outcomes"]["greedy"]["costs"]
+    )
+    assert compared(states=4, runs="more", out="other") == 0
+    path.write_text("{")
+    assert compared("--methods", "greedy") == 2
+    assert "is damaged" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
