@@ -104,7 +104,7 @@ class Compare:
     """The problem, as for the command train."""
 
     checkpoint: Path | None = None
-    """A trained policy of the problem; with it come online rollout on top of it, and PPO with as many steps: hours."""
+    """A trained policy; with it come online rollout on top of it, and PPO with as many belief steps as its labels took."""
 
     methods: tuple[str, ...] | None = None
     """Names of the methods to compare with the baseline, as the table has them; all if left out."""

@@ -34,7 +34,7 @@ from torchrl_pomdp.report.run_folder import read_iterations, read_run_folder
 from torchrl_pomdp.reproduce import EXPERIMENTS
 from torchrl_pomdp.reproduce import reproduce as reproduce_experiment
 from torchrl_pomdp.tensor_checks import check_device
-from torchrl_pomdp.trainers import compare_peers, load_checkpoint, r_nt
+from torchrl_pomdp.trainers import Checkpoint, compare_peers, load_checkpoint, r_nt
 from torchrl_pomdp.trainers.ppo import BATCH
 from torchrl_pomdp.trainers.run import TrainingRun
 from torchrl_pomdp.workers import LOCAL, Workers
@@ -176,7 +176,7 @@ def compare(command: Compare) -> None:
         problem,
         runs / name,
         checkpoint=given,
-        ppo_steps=None if command.checkpoint is None else _simulated_steps(command.checkpoint.parent),
+        ppo_steps=None if command.checkpoint is None or given is None else _ppo_steps(command.checkpoint.parent, given),
         methods=command.methods,
         states=command.states,
         seconds=command.seconds,
@@ -226,11 +226,25 @@ def changes(command: Changes) -> None:
     print(f"\n{text}\n", flush=True)
 
 
-def _simulated_steps(folder: Path) -> int | None:
-    """Belief steps that the labels of a run took, but no fewer than PPO takes; None where the folder does not say."""
-    iterations = read_iterations(folder / "iterations.json")
+def _ppo_steps(folder: Path, trained: Checkpoint) -> int | None:
+    """Belief steps of PPO beside a trained policy of a run, said aloud; None where the folder does not tell of them."""
+    steps = _simulated_steps(folder, trained.iteration)
+    of = f"labels of {trained.algorithm} took up to iteration {trained.iteration}"
+    if steps is None:
+        why = f"{folder / 'iterations.json'} does not tell of them" if trained.iteration else "a base policy has none"
+        print(f"without PPO, which takes as many belief steps as the {of}: {why}", flush=True)
+    else:
+        print(f"PPO takes as many belief steps as the {of}, and {BATCH:,} at least: {steps:,}", flush=True)
+    return steps
+
+
+def _simulated_steps(folder: Path, last: int) -> int | None:
+    """Belief steps that the labels of a run's iterations up to the ``last`` one took, but no fewer than PPO takes; None where
+    the folder does not tell of all of them.
+    """
+    iterations = [each for each in read_iterations(folder / "iterations.json") if each["number"] <= last]
     steps = sum(part["simulated_steps"] for iteration in iterations for part in iteration["parts"].values())
-    return max(steps, BATCH) if iterations else None
+    return max(steps, BATCH) if 0 < last == len(iterations) else None
 
 
 def reproduce(command: Reproduce) -> None:

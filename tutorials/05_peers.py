@@ -253,7 +253,7 @@ print(table([Result(name, compare(costs, large_baseline)) for name, costs in las
 # # Where to go on
 #
 # - `torchrl-pomdp compare linear20 --states 100 --seconds 0.02` gives every method the same *time* for a decision, and keeps
-#   what it has measured; `--checkpoint` adds a trained policy and PPO with as many belief steps.
+#   what it has measured; `--checkpoint` adds a trained policy and PPO with as many belief steps as its labels took.
 # - `trainers.ppo(problem, steps=2_000_000)` is PPO for large problems.
 # - Networks that imitate rollout decide as fast as PPO's, and are trained with the model: tutorials 1 and 3.
 # - Your own problem: tutorial 8. The tree searches need arrays (`TabularModel`) or a repair problem; rollout and PPO take any

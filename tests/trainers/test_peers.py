@@ -133,23 +133,41 @@ def test_what_does_not_belong_is_refused(folder, line3, checkpoint, linear20, tm
     assert not list(tmp_path.iterdir())
 
 
-def write_iterations(folder, *steps):
+def write_iterations(folder, *iterations):
+    """Iterations by the belief steps of their parts."""
     numbers = {"samples": 1, "label_seconds": 1.0, "train_seconds": 1.0, "losses": {}}
-    parts = {str(part): {"simulated_steps": made, **numbers} for part, made in enumerate(steps)}
-    (folder / "iterations.json").write_text(json.dumps([{"number": 1, "reason": "better", "parts": parts}]))
+    content = [
+        {
+            "number": number,
+            "reason": "better",
+            "parts": {str(p): {"simulated_steps": n, **numbers} for p, n in enumerate(steps)},
+        }
+        for number, steps in enumerate(iterations, 1)
+    ]
+    (folder / "iterations.json").write_text(json.dumps(content))
 
 
-def test_ppo_takes_as_many_steps_as_the_labels_did_but_no_fewer_than_it_can(tmp_path):
-    assert commands._simulated_steps(tmp_path) is None
-    write_iterations(tmp_path, 3000, 4000)
-    assert commands._simulated_steps(tmp_path) == 7000
-    write_iterations(tmp_path, 3, 4)
-    assert commands._simulated_steps(tmp_path) == 4096
+def test_ppo_takes_as_many_steps_as_the_labels_did_but_no_fewer_than_it_can(line3, checkpoint, tmp_path, capsys):
+    assert commands._ppo_steps(tmp_path, checkpoint) is None
+    path = tmp_path / "iterations.json"
+    assert f"without PPO, which takes as many belief steps as the labels of pAPI-NT took up to iteration 1: {path} does" in (
+        capsys.readouterr().out
+    )
+    write_iterations(tmp_path, (3000, 4000), (500, 600))
+    assert commands._ppo_steps(tmp_path, checkpoint) == 7000
+    assert "labels of pAPI-NT took up to iteration 1, and 4,096 at least: 7,000" in capsys.readouterr().out
+    assert commands._ppo_steps(tmp_path, replace(checkpoint, iteration=2)) == 8100
+    # What a run has not finished, or never begun, has no number of steps.
+    assert commands._ppo_steps(tmp_path, replace(checkpoint, iteration=3)) is None
+    assert commands._ppo_steps(tmp_path, replace(checkpoint, policy=line3.base_policies["greedy"], iteration=0)) is None
+    assert "up to iteration 0: a base policy has none" in capsys.readouterr().out
+    write_iterations(tmp_path, (3, 4))
+    assert commands._ppo_steps(tmp_path, checkpoint) == 4096
 
 
 def test_the_command_writes_table_and_pictures(line3, checkpoint, tmp_path, capsys, monkeypatch):
     save_checkpoint(tmp_path / "best.pt", checkpoint)
-    write_iterations(tmp_path, 40_000, 2_000)
+    write_iterations(tmp_path, (40_000, 2_000), (5_000,))
     given = []
 
     def few(problem, folder, **options):

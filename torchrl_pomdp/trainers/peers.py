@@ -9,7 +9,8 @@ pAPI-NT k, …   the trained policy, and online rollout on top of it
 POMCP, DESPOT  tree searches: ``orig`` with every control that can be carried out and random play, as out of the box,
                where that is more than the legal ones;
                ``mod`` with legal controls and random play; ``fair`` with legal controls and a good base policy
-PPO            masked proximal policy optimisation, with as many belief steps as policy iteration has simulated
+PPO            masked proximal policy optimisation, from the command line with as many belief steps as the labels of policy
+               iteration took; visits and validations of policy iteration come on top of them
 ============== ==================================================================================================
 """
 
