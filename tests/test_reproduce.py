@@ -15,7 +15,16 @@ from torchrl_pomdp import provenance as provenance_module
 from torchrl_pomdp import reproduce as module
 from torchrl_pomdp.evaluation import compare
 from torchrl_pomdp.provenance import provenance
-from torchrl_pomdp.report import Result, cost_figure, draw, iteration_figure, paired_table, table
+from torchrl_pomdp.report import (
+    Result,
+    cost_figure,
+    draw,
+    is_iteration,
+    iteration_figure,
+    paired_ratios,
+    paired_table,
+    table,
+)
 from torchrl_pomdp.reproduce import EXPERIMENTS, OPTIMA, Experiment, comparison_table, plan, reproduce, settings_config
 
 TOY = Experiment("toy", ("line3",), ("pAPI-NT", "pAPI-T"))
@@ -120,6 +129,32 @@ def test_a_ratio_that_means_nothing_is_a_dash(tmp_path):
     assert [label.get_text().split("\n")[-1] for label in labels] == ["+0"]  # the difference, where there is no ratio
     figures = {tmp_path / "lines.png": lambda: iteration_figure({"a": [found, compare(cost + 5, cost + 5)]})}
     assert draw(figures) == f"pictures: {tmp_path / 'lines.png'}"
+
+
+def test_runs_of_several_robots_have_paired_ratios():
+    """To all online rollouts of the base policy: costs are multiples of the first one's, and so are their ratios."""
+    factors = {
+        "greedy": 2.0, "rule 2": 1.5, "one-at-a-time of greedy": 1.0, "order-optimised of greedy": 0.9, "R-NT of greedy": 0.8,
+        "API 1": 0.75, "API 2": 0.6, "API 2 + one-at-a-time": 0.5,
+    }  # fmt: skip
+    cost = torch.tensor([10.0, 20.0, 60.0])
+    ratios = paired_ratios({name: factor * cost for name, factor in factors.items()})
+    online = ["one-at-a-time of greedy", "order-optimised of greedy", "R-NT of greedy"]
+    assert list(ratios) == [*online[1:], "API 1", "API 2", "API 2 + one-at-a-time"]
+    for name, row in ratios.items():
+        assert list(row) == [other for other in (*online, "API 1", "API 2") if other != name]
+        for other, ratio in row.items():
+            assert ratio.mean == pytest.approx(factors[name] / factors[other])
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in paired_table("network", ratios).splitlines()]
+    assert rows[0] == ["network: ratio to", online[0], online[2], online[1], "API 2"]
+    assert rows[-1][0] == "API 2 + one-at-a-time"
+    assert [cell.split()[0] for cell in rows[-1][1:]] == ["0.5000", "0.6250", "0.5556", "0.8333"]
+
+
+@pytest.mark.parametrize("name", ["rule 2", "pAPI 2", "API two", "my API 2", "API 2 + one-at-a-time", "R-NT of API 2"])
+def test_only_what_an_iteration_has_trained_is_one(name):
+    assert not is_iteration(name)
+    assert is_iteration("API 12")
 
 
 def test_the_commit_is_that_of_this_librarys_checkout(tmp_path, monkeypatch):

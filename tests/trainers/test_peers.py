@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -87,6 +88,24 @@ def test_a_checkpoint_without_parts_is_of_the_problem_too(line3, tmp_path):
     assert list(outcomes["API 1"].costs) == costs.tolist()
     bare = replace(own, policy=line3.base_policies["urgency"], iteration=0)
     assert "R-T of urgency" not in peers._peers(line3, bare, 0.01)
+
+
+@pytest.mark.parametrize("name", ["POMCP mod", "PPO", "R-NT of urgency", "pAPI-NT 1", "pAPI-NT 1 + R-NT"])
+def test_no_base_policy_is_named_like_another_method(line3, checkpoint, tmp_path, name):
+    first, last = line3.base_policies.items()
+    problem = replace(line3, base_policies=dict([first, (name, GreedyRepair(line3.model)), last]), spec=None)
+    with pytest.raises(ValueError, match=f"base_policies must have names that no other method has, got '{re.escape(name)}'"):
+        compare_peers(problem, tmp_path / "run", checkpoint=checkpoint, states=2, seconds=0.001)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_of_a_base_policy_has_its_name(line3, checkpoint):
+    greedy, urgency = line3.base_policies.values()
+    own = replace(checkpoint, policy=urgency, iteration=0)
+    assert peers._peers(line3, own, 0.01)["urgency"].policy is urgency
+    other = replace(line3, base_policies={"greedy": greedy, "urgency": GreedyRepair(line3.model)}, spec=None)
+    with pytest.raises(ValueError, match="got 'urgency'"):
+        peers._peers(other, own, 0.01)
 
 
 def test_only_the_original_mode_may_do_everything(line3):

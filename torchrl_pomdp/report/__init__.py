@@ -2,8 +2,9 @@
 
 from torchrl_pomdp.report.effort import Effort, effort, effort_table
 from torchrl_pomdp.report.figures import cost_figure, draw, iteration_figure, time_figure
+from torchrl_pomdp.report.names import is_iteration
 from torchrl_pomdp.report.peers import Outcome, peer_figure, peer_table
-from torchrl_pomdp.report.tables import Result, interval_text, is_iteration, paired_ratios, paired_table, ratio_texts, table
+from torchrl_pomdp.report.tables import Result, interval_text, paired_ratios, paired_table, ratio_texts, table
 
 __all__ = [
     "Effort",

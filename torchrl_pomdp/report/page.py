@@ -16,9 +16,10 @@ from torchrl_pomdp.files import write_bytes
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.report.disagreements import Disagreements, disagreements
 from torchrl_pomdp.report.iteration_chart import iteration_chart
+from torchrl_pomdp.report.names import is_iteration
 from torchrl_pomdp.report.player import player_data, side_by_side, starts
 from torchrl_pomdp.report.run_folder import RunFolder, read_run_folder
-from torchrl_pomdp.report.tables import interval_text, is_iteration, ratio_texts
+from torchrl_pomdp.report.tables import interval_text, ratio_texts
 from torchrl_pomdp.trajectories import has_world
 
 __all__ = ["write_report"]

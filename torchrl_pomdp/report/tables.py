@@ -9,9 +9,10 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_mapping, check_sequence, check_text
 from torchrl_pomdp.evaluation import Comparison, Estimate, compare
+from torchrl_pomdp.report.names import is_iteration, is_on_top, is_online
 from torchrl_pomdp.tensor_checks import check_tensor
 
-__all__ = ["Result", "half_width", "interval_text", "is_iteration", "paired_ratios", "paired_table", "ratio_texts", "table"]
+__all__ = ["Result", "half_width", "interval_text", "paired_ratios", "paired_table", "ratio_texts", "table"]
 
 
 @dataclass(frozen=True)
@@ -100,24 +101,13 @@ def _decimals(value: Estimate) -> int:
     return 2 if half_width(value) < 1 else 1
 
 
-def is_iteration(policy: str) -> bool:
-    """Whether a policy's name is that of what an iteration has trained.
-
-    Raises:
-        TypeError: if something is of the wrong kind.
-
-    Examples:
-        >>> is_iteration("pAPI-NT 2"), is_iteration("pAPI-NT 2 + R-NT"), is_iteration("greedy")
-        (True, False, False)
-    """
-    return check_instance("policy", policy, str).rpartition(" ")[2].isdigit()
-
-
 def paired_ratios(costs: Mapping[str, Tensor]) -> dict[str, dict[str, Estimate | None]]:
     """Ratios of what was trained, and of online rollout on top of it, to online rollout of the base policy and to each other.
 
+    Of several online rollouts of the base policy the later ones have ratios as well.
+
     Args:
-        costs: costs from the same start states under the same noise, by policy.
+        costs: costs from the same start states under the same noise, by policy, each named as a training run names it.
 
     Returns:
         the ratios by policy and by the policy that it is divided by; None where a ratio means nothing.
@@ -137,8 +127,8 @@ def paired_ratios(costs: Mapping[str, Tensor]) -> dict[str, dict[str, Estimate |
     for name, values in costs.items():
         check_tensor(f"costs[{name!r}]", values, (None,))
     trained = [name for name in costs if is_iteration(name)]
-    rollout = [name for name in costs if name.startswith(("R-NT of", "R-T of"))]
-    rows = [name for name in costs if name in trained or name.endswith("+ R-NT") or name.startswith("R-T of")]
+    rollout = [name for name in costs if is_online(name)]
+    rows = [name for name in costs if name in trained or name in rollout[1:] or is_on_top(name)]
     ratios: dict[str, dict[str, Estimate | None]] = {}
     for name in rows:
         ratios[name] = {}

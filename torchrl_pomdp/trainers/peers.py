@@ -113,7 +113,7 @@ def compare_peers(
         ImportError: if numba, which the extra ``fast`` installs, is missing.
         TypeError: if an argument is of the wrong kind.
         ValueError: if a number is out of range, a method is not there, the folder holds something else, the checkpoint is of
-            another problem, or the model or the last base policy has no scalar twin.
+            another problem, a base policy is named like another method, or model or last base policy have no scalar twin.
 
     Examples:
         >>> import tempfile
@@ -168,7 +168,7 @@ def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> d
     model, bases = problem.model, problem.base_policies
     base_name, base = list(bases.items())[-1]
     online: dict[str, Any] = {"trajectories": _TRAJECTORIES, "allocation": "adaptive", "seconds": seconds}
-    peers = {name: _Peer(policy) for name, policy in bases.items()}
+    peers: dict[str, _Peer] = {}
     peers[f"R-NT of {base_name}"] = _Peer(RolloutPolicy(model, base, **online))
     if checkpoint is not None:
         # Without value networks there is nothing to cut simulations by.
@@ -189,7 +189,11 @@ def _peers(problem: Problem, checkpoint: Checkpoint | None, seconds: float) -> d
             peers[f"{name} orig"] = _Peer(search(everything, None, seconds=seconds, **as_they_come), unrestricted=True)
         peers[f"{name} mod"] = _Peer(search(model, None, seconds=seconds, **as_they_come))
         peers[f"{name} fair"] = _Peer(search(model, base, seconds=seconds, **options))
-    return peers
+    for name, policy in bases.items():
+        # A checkpoint may hold a base policy, by its name.
+        if name == "PPO" or (name in peers and digest(peers[name].policy) != digest(policy)):
+            raise ValueError(f"base_policies must have names that no other method has, got {name!r}")
+    return {name: _Peer(policy) for name, policy in bases.items()} | peers
 
 
 def _scenarios(seconds: float) -> int:

@@ -29,8 +29,8 @@ from torchrl_pomdp.modules import (
     TerminalCost,
     Truncation,
 )
-from torchrl_pomdp.modules.multiagent import SCHEMES
 from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.report.names import SCHEME_NAMES
 from torchrl_pomdp.trainers.plan import Evaluate, Improve
 from torchrl_pomdp.trainers.policy_iteration import PolicyIteration
 
@@ -81,9 +81,10 @@ def multiagent_rollouts(
     check_instance("problem", problem, Problem)
     steps = check_instance("config", config, PolicyIterationConfig).label_steps
     options: dict[str, Any] = {"trajectories": trajectories, "max_steps": steps, "terminal_cost": problem.pessimistic_cost}
-    schemes = SCHEMES if problem.model.enumerable else [scheme for scheme in SCHEMES if scheme != "order_optimised"]
     return {
-        scheme.replace("_", "-"): MultiagentRollout(problem.model, base_policy, scheme=scheme, **options) for scheme in schemes
+        name: MultiagentRollout(problem.model, base_policy, scheme=scheme, **options)
+        for scheme, name in SCHEME_NAMES.items()
+        if problem.model.enumerable or scheme != "order_optimised"
     }
 
 

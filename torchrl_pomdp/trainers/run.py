@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
@@ -25,8 +24,8 @@ from torchrl_pomdp.files import DamagedFileError, check_claimed, read_json, writ
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue, Policy
-from torchrl_pomdp.modules.multiagent import SCHEMES
 from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.report.names import ALGORITHM_NAMES, is_own
 from torchrl_pomdp.report.run_folder import read_iterations
 from torchrl_pomdp.trainers.architecture import is_multiagent
 from torchrl_pomdp.trainers.asynchronous import AsynchronousIteration
@@ -38,12 +37,8 @@ from torchrl_pomdp.workers import LOCAL, Workers
 
 __all__ = ["ALGORITHMS", "TrainingRun"]
 
-ALGORITHMS = {"pAPI-NT": papi_nt, "pAPI-T": papi_t, "API": api}
+ALGORITHMS = dict(zip(ALGORITHM_NAMES, (papi_nt, papi_t, api), strict=True))
 """The algorithms that learn, by name."""
-
-_ONLINE = "|".join(["R-NT", "R-T", *(scheme.replace("_", "-") for scheme in SCHEMES)])
-# What a run calls the policies that it makes.
-_OWN_NAME = re.compile(rf"({'|'.join(ALGORITHMS)}) \d+|({_ONLINE}) of .+|.+ \+ ({_ONLINE})")
 
 Report = Callable[[str, Comparison], None]
 
@@ -105,7 +100,7 @@ class TrainingRun:
         object.__setattr__(self, "base", base)
         check_instance("config", self.config, PolicyIterationConfig)
         for name in self.problem.base_policies:
-            if _OWN_NAME.fullmatch(name):
+            if is_own(name):
                 raise ValueError(f"base_policies must have names that no policy of a run has, such as 'API 1', got {name!r}")
         check_integer("states", self.states, 1, MAX_STATES)
         check_integer("rollout_states", self.rollout_states, 0, MAX_STATES)
