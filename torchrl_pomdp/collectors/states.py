@@ -90,6 +90,6 @@ def training_states(problem: Problem, memory: StateMemory | None, part: int, *, 
         check_instance("memory", memory, StateMemory)
     visited_share = check_number("visited_share", visited_share, "[0, 1]")
     random = problem.training[check_integer("part", part, 0, len(problem.training) - 1)]
-    if memory is None or memory.count(part) == 0:
+    if memory is None or visited_share == 0.0 or memory.count(part) == 0:
         return random
     return Mixture([random, memory.generator(part)], [1.0 - visited_share, visited_share])
