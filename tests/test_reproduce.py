@@ -19,6 +19,7 @@ from torchrl_pomdp.report import (
     Result,
     cost_figure,
     draw,
+    effort,
     is_iteration,
     iteration_figure,
     paired_ratios,
@@ -149,6 +150,32 @@ def test_runs_of_several_robots_have_paired_ratios():
     assert rows[0] == ["network: ratio to", online[0], online[2], online[1], "API 2"]
     assert rows[-1][0] == "API 2 + one-at-a-time"
     assert [cell.split()[0] for cell in rows[-1][1:]] == ["0.5000", "0.6250", "0.5556", "0.8333"]
+
+
+def effort_record(samples, steps, seconds):
+    return {"samples": samples, "simulated_steps": steps, "label_seconds": seconds, "train_seconds": 0.0}
+
+
+def test_the_effort_of_parts_at_their_own_pace():
+    """Their records come part by part, the startgame's first; a part waits for none that is as far as it must be."""
+    start, end = ["iteration-{}/2-improve-part-0", "iteration-{}/1-improve-part-1"]
+    seconds = {0: (1.0, 1.0, 5.0), 1: (2.0, 6.0, 1.0)}
+    parts = {start.format(number): effort_record(10, 1000 * number, seconds[0][number - 1]) for number in (1, 2, 3)}
+    parts |= {end.format(number): effort_record(20, 60, seconds[1][number - 1]) for number in (1, 2, 3)}
+    expected = {
+        # Beginnings and ends of the versions of part 0: 0-1, 2-3, 8-13; of part 1: 0-2, 2-8, 8-9.
+        0: 13.0,
+        # Part 0: 0-1, 1-2, 2-7; part 1: 0-2, 2-8, 8-9.
+        1: 9.0,
+        5: 9.0,
+        # Where they wait after every step: 2 + 1 + 6 + 1 + 1 + 5.
+        None: 16.0,
+    }
+    for staleness, taken in expected.items():
+        found = effort([{"parts": parts, "staleness": staleness}])
+        assert found.steps_per_label == (1000 + 2000 + 3000) / 30
+        assert found.parallel_seconds == taken
+        assert (found.labels, found.label_seconds) == (90, 16.0)
 
 
 @pytest.mark.parametrize("name", ["rule 2", "pAPI 2", "API two", "my API 2", "API 2 + one-at-a-time", "R-NT of API 2"])

@@ -264,6 +264,8 @@ def test_a_training_run(line3, tmp_path):
     first = run.carry_out(tmp_path / "run")
     assert list(first) == ["greedy", "urgency", "R-NT of greedy", "pAPI-NT 1", "pAPI-NT 2"]
     assert run.carry_out(tmp_path / "run") == first
+    # What the effort of parts at their own pace is computed by.
+    assert [each["staleness"] for each in json.loads((tmp_path / "run/iterations.json").read_text())] == [1, 1]
     with pytest.raises(ValueError, match="staleness"):
         replace(run, staleness=None).carry_out(tmp_path / "run")
 

@@ -155,14 +155,11 @@ def test_what_does_not_belong_is_refused(folder, line3, checkpoint, linear20, tm
 def write_iterations(folder, *iterations):
     """Iterations by the belief steps of their parts."""
     numbers = {"samples": 1, "label_seconds": 1.0, "train_seconds": 1.0, "losses": {}}
-    content = [
-        {
-            "number": number,
-            "reason": "better",
-            "parts": {str(p): {"simulated_steps": n, **numbers} for p, n in enumerate(steps)},
-        }
-        for number, steps in enumerate(iterations, 1)
-    ]
+    content = []
+    for number, steps in enumerate(iterations, 1):
+        made = {f"iteration-{number}/1-improve-part-{part}": own for part, own in enumerate(steps)}
+        parts = {name: {"simulated_steps": own, **numbers} for name, own in made.items()}
+        content.append({"number": number, "reason": "better", "parts": parts})
     (folder / "iterations.json").write_text(json.dumps(content))
 
 

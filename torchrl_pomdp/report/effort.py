@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 from torchrl_pomdp.checks import check_mapping, check_sequence, shown
 
 __all__ = ["Effort", "check_iterations", "effort", "effort_table"]
 
+# Iteration or version, step of the plan, and part.
+_NAME = re.compile(r"iteration-(\d+)/(\d+)-[a-z]+-part-(\d+)")
 _NUMBERS = ("samples", "simulated_steps", "label_seconds", "train_seconds")
 
 
@@ -20,11 +24,12 @@ class Effort:
 
     Attributes:
         labels: labelled states.
-        steps_per_label: belief steps behind a label of the last step of each iteration, that of the startgame; None where an
-            iteration has one step alone.
+        steps_per_label: belief steps behind a label of the last step of an iteration, that of the startgame; None where
+            iterations have one step alone.
         label_seconds: time of labelling.
         train_seconds: time of optimisation.
-        parallel_seconds: both together, had every part a processor of its own: the longest part of every step counts.
+        parallel_seconds: both together, had every part a processor of its own: the longest part of every step counts. Parts
+            at their own pace wait for those alone that are more versions behind than they may be.
     """
 
     labels: int
@@ -48,34 +53,62 @@ def effort(iterations: Sequence[Mapping[str, Any]]) -> Effort:
         Effort(labels=20, steps_per_label=40.0, label_seconds=4.0, train_seconds=2.0, parallel_seconds=6.0)
     """
     check_iterations("iterations", iterations)
-    steps: dict[str, list[Mapping[str, Any]]] = {}
-    last = []
-    for iteration in iterations:
-        for part, record in iteration["parts"].items():
-            step = part.rsplit("-part-", 1)[0]
-            steps.setdefault(step, []).append(record)
-        last += steps[step]
-    records = [record for found in steps.values() for record in found]
+    records = [(_place(name), record) for iteration in iterations for name, record in iteration["parts"].items()]
+    first, last = (choose(place.step for place, _ in records) for choose in (min, max))
+    startgame = [record for place, record in records if place.step == last]
+    label, train = (sum(record[key] for _, record in records) for key in ("label_seconds", "train_seconds"))
     return Effort(
-        labels=sum(record["samples"] for record in records),
+        labels=sum(record["samples"] for _, record in records),
         steps_per_label=None
-        if len(steps) == len(iterations)
-        else sum(record["simulated_steps"] for record in last) / sum(record["samples"] for record in last),
-        label_seconds=sum(record["label_seconds"] for record in records),
-        train_seconds=sum(record["train_seconds"] for record in records),
-        # The parts of a step do not wait for each other, steps do.
-        parallel_seconds=sum(max(r["label_seconds"] + r["train_seconds"] for r in found) for found in steps.values()),
+        if first == last
+        else sum(record["simulated_steps"] for record in startgame) / sum(record["samples"] for record in startgame),
+        label_seconds=label,
+        train_seconds=train,
+        parallel_seconds=_parallel_seconds(records, iterations[0].get("staleness")),
     )
+
+
+class _Place(NamedTuple):
+    """What a record is of."""
+
+    number: int
+    step: int
+    part: int
+
+
+def _place(name: str) -> _Place:
+    found = cast(re.Match[str], _NAME.fullmatch(name))
+    return _Place(*map(int, found.groups()))
+
+
+def _parallel_seconds(records: Sequence[tuple[_Place, Mapping[str, Any]]], staleness: int | None) -> float:
+    """The time that the parts take side by side."""
+    seconds: Counter[tuple[tuple[int, int], int]] = Counter()
+    for place, record in records:
+        # Parts wait for each other after every step or, at their own pace, take the steps of a version one after the other.
+        turn = (place.number, place.step if staleness is None else 0)
+        seconds[turn, place.part] += record["label_seconds"] + record["train_seconds"]
+    parts = {part for _, part in seconds}
+    done: list[dict[int, float]] = []
+    for turn in sorted({turn for turn, _ in seconds}):
+        behind = len(done) - 1 - (staleness or 0)
+        begin = max(done[behind].values()) if behind >= 0 else 0.0
+        own = done[-1] if done else dict.fromkeys(parts, 0.0)
+        done.append({part: max(begin, own[part]) + seconds[turn, part] for part in parts})
+    return max(done[-1].values())
 
 
 def check_iterations(name: str, iterations: Any) -> None:
     """Raise unless these are iterations as a run's ``iterations.json`` has them."""
     for iteration in check_sequence(name, iterations, Mapping, least=1):
-        parts = iteration.get("parts")
-        records = list(parts.values()) if isinstance(parts, Mapping) else []
-        if not records or not all(
-            isinstance(r, Mapping) and all(isinstance(r.get(n), Real) for n in _NUMBERS) for r in records
-        ):
+        parts, staleness = iteration.get("parts"), iteration.get("staleness")
+        records = parts if isinstance(parts, Mapping) else {}
+        sound = all(
+            isinstance(key, str) and _NAME.fullmatch(key) and isinstance(r, Mapping)
+            and all(isinstance(r.get(n), Real) for n in _NUMBERS)
+            for key, r in records.items()
+        )  # fmt: skip
+        if not records or not sound or not (staleness is None or (type(staleness) is int and staleness >= 0)):
             raise ValueError(f"{name} must be what a run's iterations.json holds, got {shown(iteration)} among them")
 
 

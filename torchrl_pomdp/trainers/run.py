@@ -251,7 +251,7 @@ class _Execution:
             if iteration.number == 1 and together.plan[-1].truncation is not None:
                 self._compare_truncated(base, iteration.value)
             self._compare(name, iteration.policy, run.states)
-            summaries.append(_summary(iteration))
+            summaries.append({**_summary(iteration), "staleness": run.staleness})
             if iteration.number >= known:
                 write_json(self.folder / "iterations.json", summaries)
         self._keep("best.pt", kept_best)
