@@ -104,6 +104,22 @@ def test_the_loss_is_that_of_each_agents_decision():
         ClassificationLoss(network)(labelled.clone().set("action", torch.full((20,), 99)))
 
 
+def test_the_loss_of_networks_of_parts_is_that_of_each_in_its_part():
+    networks = [AgentNetwork(RobotEncoder(MODEL), (8,), generator=generator()) for _ in range(2)]
+    with torch.no_grad():
+        networks[1].own.mul_(3.0)
+        networks[1].network[-1].weight.mul_(-2.0)
+    labelled = MultiagentRollout(MODEL, GreedyRepair(MODEL), trajectories=2)(random_states(MODEL, 20, 0))
+    part = (torch.arange(20) % 4 == 1).long()
+    found = ClassificationLoss(PartitionedPolicy(networks), "cross_entropy")(labelled.set("partition", part))
+    losses = [ClassificationLoss(network, "cross_entropy") for network in networks]
+    own = [loss(labelled[part == number])["loss_policy"] for number, loss in enumerate(losses)]
+    torch.testing.assert_close(found["loss_policy"], 0.75 * own[0] + 0.25 * own[1])
+    assert not torch.isclose(own[0], own[1])
+    whole = ClassificationLoss(PartitionedPolicy(networks[:1] * 2), "cross_entropy")(labelled)
+    torch.testing.assert_close(whole["loss_policy"], losses[0](labelled)["loss_policy"])
+
+
 @pytest.mark.parametrize("name", ["two_robots20", "network32x8"])
 def test_policy_iteration_of_many_agents(name, tmp_path):
     """Trained on one-at-a-time labels; a run goes on where it stopped; the policy is kept in a file."""

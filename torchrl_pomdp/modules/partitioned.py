@@ -68,7 +68,9 @@ class _Partitioned(TensorDictModuleBase):
         known = part.dtype == torch.int64 and (part.numel() == 0 or 0 <= int(part.min()) <= int(part.max()) < len(members))
         if not known:
             raise ValueError(f"partition must hold parts 0..{len(members) - 1}, got {part.unique().tolist()}")
-        flat = flat_rows(tensordict.select(*self.in_keys))
+        # What agents are told, where their networks are taught.
+        told = [] if tensordict.get("told", None) is None else ["told"]
+        flat = flat_rows(tensordict.select(*self.in_keys, *told))
         result = self._route(flat, part, members)
         return tensordict.update(result.reshape(tensordict.batch_size))
 

@@ -3,7 +3,7 @@ r"""Training a policy network on rollout controls is a classification problem (p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -12,7 +12,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_choice, check_instance
+from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.agents import AgentNetwork
+from torchrl_pomdp.modules.partitioned import PartitionedPolicy
 from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, with_weights, without_modes
 
 __all__ = ["ClassificationLoss"]
@@ -96,8 +98,9 @@ class ClassificationLoss(LabelLoss):
         """Loss and metrics of labelled states ``[*B]``; see the class."""
         batch = check_batch(tensordict, self.in_keys)
         y = batch.select(*self.policy.in_keys)
-        if isinstance(self.policy, AgentNetwork):
-            label = self._told(batch)
+        network = self.policy.policies[0] if isinstance(self.policy, PartitionedPolicy) else self.policy
+        if isinstance(network, AgentNetwork):
+            label = self._told(batch, network.model)
             y.set("told", label)
         else:
             label = label_of(batch, self.tensor_keys.action, 1, floating=False)
@@ -118,9 +121,8 @@ class ClassificationLoss(LabelLoss):
             }
         )
 
-    def _told(self, batch: TensorDictBase) -> Tensor:
-        """The labels of a network for many agents, their controls ``[N, R]``."""
-        model = cast(AgentNetwork, self.policy).model
+    def _told(self, batch: TensorDictBase, model: BeliefModel) -> Tensor:
+        """The labels of networks for many agents, their controls ``[N, R]``."""
         label = label_of(batch, self.tensor_keys.action, 1 + len(model.control_shape), floating=False)
         if not bool(((label >= 0) & (label < model.control_range)).all()):
             raise ValueError("action must be a legal control, one with a finite Q-factor, got another")
