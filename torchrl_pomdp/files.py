@@ -242,11 +242,24 @@ def _write_new(path: Path, content: bytes) -> bool:
     """Write a file that nobody else has written meanwhile, whole or not at all; False where somebody has."""
     try:
         with _written(path, content) as temporary:
-            # Unlike a renaming, a link does not replace what is there.
-            os.link(temporary, path)
+            _link_new(temporary, path)
     except FileExistsError:
         return False
     return True
+
+
+def _link_new(temporary: Path, path: Path) -> None:
+    """Give a file another name, which is new; a ``FileExistsError`` where it is not."""
+    try:
+        # Unlike a renaming, a link does not replace what is there.
+        os.link(temporary, path)
+    except FileExistsError:
+        raise
+    except OSError:
+        # File systems without links: an empty file takes the name first. Whoever reads it meanwhile, or after a kill, finds
+        # it damaged.
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+        os.replace(temporary, path)
 
 
 def check_claimed(path: Path, cause: BaseException | None = None) -> None:
