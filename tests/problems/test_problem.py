@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from torchrl_pomdp.cli import main
@@ -17,6 +19,16 @@ def test_what_an_evaluation_cuts_does_not_outweigh_small_costs(capsys):
     assert float(row.split("|")[2].split("±")[0]) == pytest.approx(20.0, abs=0.05)
     line3 = make_problem("line3")
     assert line3.evaluation_cost is line3.pessimistic_cost
+
+
+def test_the_first_symmetry_is_the_identity(line3):
+    identity, mirror = line3.symmetries
+    for sound in ((identity, mirror), (lambda y: y, mirror), (lambda y: y.copy(),)):
+        assert len(replace(line3, symmetries=sound, spec=None).symmetries) == len(sound)
+    with pytest.raises(ValueError, match="symmetries must hold the identity first, got one that changes 'belief'"):
+        replace(line3, symmetries=(mirror, identity), spec=None)
+    with pytest.raises(TypeError, match=r"symmetries\[0\]\(y\)"):
+        replace(line3, symmetries=(lambda y: None,), spec=None)
 
 
 @pytest.mark.parametrize("robots", [1, 8])

@@ -32,6 +32,8 @@ Symmetry = Callable[[TensorDictBase], TensorDictBase]
 _STATES = 2048
 # And so many joint controls of each, where there are too many to try them all.
 _DRAWS = 32
+# Start states of which the first symmetry shows that it is the identity.
+_IMAGES = 16
 # Stands for what is made of the model.
 _DEFAULT: Any = None
 
@@ -67,7 +69,8 @@ class Problem:
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if there is not one training generator for each part, or no base policy.
+        ValueError: if there is not one training generator for each part, or no base policy, or the first symmetry changes
+            start states.
 
     Examples:
         >>> from torchrl_pomdp.envs import FixedBelief, TabularModel
@@ -104,6 +107,7 @@ class Problem:
             base_policies=_checked_policies(self.base_policies, model),
             symmetries=_checked_symmetries(self.symmetries),
         )
+        _check_identity(self.symmetries[0], model, self.start)
         if self.spec is not None:
             object.__setattr__(self, "spec", copy.deepcopy(check_mapping("spec", self.spec, object)))
         if self.pessimistic_cost is None:
@@ -179,6 +183,17 @@ def _checked_symmetries(symmetries: Any) -> tuple[Symmetry, ...]:
     for i, symmetry in enumerate(given):
         check_callable(f"symmetries[{i}]", symmetry)
     return given
+
+
+def _check_identity(symmetry: Symmetry, model: BeliefModel, start: StateGenerator) -> None:
+    """Raise unless the first symmetry, the only one without mirror images, maps some start states to themselves."""
+    if symmetry is identity_symmetry:
+        return
+    y = model.drawn(start, torch.arange(_IMAGES, device=model.device), "start")
+    image = check_instance("symmetries[0](y)", symmetry(model.with_features(y)), TensorDictBase)
+    moved = next((k for k in model.state_keys if image.get(k, None) is None or not torch.equal(image.get(k), y.get(k))), None)
+    if moved is not None:
+        raise ValueError(f"symmetries must hold the identity first, got one that changes {moved!r} in start states")
 
 
 def _largest_cost(model: BeliefModel, start: StateGenerator) -> float:
