@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import torch
 
 from torchrl_pomdp.cli import main
+from torchrl_pomdp.envs import FixedBelief, TabularModel
 from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, line
+from torchrl_pomdp.evaluation import discounted_costs
 from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import Problem, make_problem
 
@@ -19,6 +22,18 @@ def test_what_an_evaluation_cuts_does_not_outweigh_small_costs(capsys):
     assert float(row.split("|")[2].split("±")[0]) == pytest.approx(20.0, abs=0.05)
     line3 = make_problem("line3")
     assert line3.evaluation_cost is line3.pessimistic_cost
+
+
+@pytest.mark.parametrize(("discount", "stages", "left"), [(0.95, 135, 0.001), (0.99, 400, 0.018)])
+def test_what_an_evaluation_leaves_out(discount, stages, left):
+    """Of a cost of 1 a stage for ever: a thousandth, or what 400 stages leave where more would be needed."""
+    change, see = torch.ones(1, 1, 1), torch.ones(1, 1, 1)
+    problem = Problem(TabularModel(change, see, torch.ones(1, 1), discount), FixedBelief(torch.ones(1)))
+    assert problem.model.horizon == stages
+    policy = problem.base_policies["myopic"]
+    costs = discounted_costs(problem.model, policy, problem.start, num_states=2, terminal_cost=problem.evaluation_cost)
+    torch.testing.assert_close(costs, torch.full((2,), (1 - discount**stages) / (1 - discount)))
+    assert 0.9 * left < 1 - float(costs[0]) * (1 - discount) <= left
 
 
 def test_the_first_symmetry_is_the_identity(line3):

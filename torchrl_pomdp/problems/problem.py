@@ -119,8 +119,11 @@ class Problem:
     def evaluation_cost(self) -> ClosedFormCost:
         """What an evaluation adds where a trajectory is cut: the pessimistic cost of the state; nothing if that is a constant.
 
-        A constant bounds the costs of all states from far above. It would be most of a small cost, while what an evaluation
-        leaves out at the model's horizon is a thousandth of it.
+        A constant bounds the costs of all states from far above, and would be most of a small cost. What an evaluation leaves
+        out at the model's horizon weighs a thousandth, of costs that stay the same; where that takes more than 400 stages, as
+        at discounts above 0.9828, up to eighteen thousandths: with 0.99 a cost of 1 a stage for ever, 100 in all, is 98.2.
+
+        Policy iteration validates with the pessimistic cost even so.
         """
         return ZeroCost() if isinstance(self.pessimistic_cost, ConstantCost) else self.pessimistic_cost
 

@@ -95,9 +95,10 @@ class PolicyIteration:
     r"""Policy iteration from a base policy: its iterations, and the best policy so far. To iterate again is to start anew.
 
     An iteration starts from the best policy so far. Its policy is accepted if, on fixed validation states and under the same
-    noise, the mean of its costs' paired differences is negative with 95 % confidence; a rejected one is dropped, and the next
+    noise, the mean of its costs' paired differences is negative with 95 % confidence. A rejected one is dropped, and the next
     iteration tries again with other training states, those where the rejected one went among them. The value networks are
-    those of the best policy, too.
+    those of the best policy, too. Where ``max_steps`` cut a trajectory its state's pessimistic cost is added, whereas
+    evaluations leave it out where that is a constant.
 
     With a ``folder`` every trained part and every block of labels is kept there as soon as it is there. The same iteration
     with the same folder goes on where an earlier one was interrupted, and gives the same result.
