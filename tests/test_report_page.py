@@ -230,6 +230,20 @@ def test_disagreements_are_counted_at_the_visited_states(linear20):
     assert int(both.sum()) == count
 
 
+@pytest.mark.parametrize(
+    ("costs", "ticks"),
+    [
+        ((1_234_560.0, 1_234_566.0), [f"123456{last}" for last in range(7)]),
+        ((1e-12, 3e-12), ["1e-12", "1.5e-12", "2e-12", "2.5e-12", "3e-12"]),
+        ((10_000.0, 70_000.0), [f"{first}0000" for first in range(1, 8)]),
+        ((0.0, 1.0), ["0", "0.2", "0.4", "0.6", "0.8", "1"]),
+    ],
+)
+def test_ticks_tell_costs_apart(costs, ticks):
+    chart = iteration_chart([(name, Estimate(cost, 0.0, 9)) for name, cost in zip(("greedy", "API 1"), costs, strict=True)], {})
+    assert re.findall(r'text-anchor="end">(.*?)<', chart) == ticks
+
+
 def test_the_chart_has_intervals_and_hollow_circles():
     costs = [("greedy", Estimate(10.0, 0.5, 9)), ("API 1", Estimate(8.0, float("nan"), 1)), ("API 2", Estimate(-3.0, 1.0, 9))]
     chart = iteration_chart(costs, {"API 2": "cost <higher>"})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import subprocess
 from dataclasses import replace
@@ -13,13 +14,14 @@ from tqdm import tqdm
 
 from torchrl_pomdp import provenance as provenance_module
 from torchrl_pomdp import reproduce as module
-from torchrl_pomdp.evaluation import compare
+from torchrl_pomdp.evaluation import Comparison, Estimate, compare
 from torchrl_pomdp.provenance import provenance
 from torchrl_pomdp.report import (
     Result,
     cost_figure,
     draw,
     effort,
+    interval_text,
     is_iteration,
     iteration_figure,
     paired_ratios,
@@ -176,6 +178,28 @@ def test_the_effort_of_parts_at_their_own_pace():
         assert found.steps_per_label == (1000 + 2000 + 3000) / 30
         assert found.parallel_seconds == taken
         assert (found.labels, found.label_seconds) == (90, 16.0)
+
+
+@pytest.mark.parametrize(
+    ("mean", "half", "text"),
+    [
+        (193.9, 0.47, "193.90 ± 0.47"), (7.25, 7.4, "7.2 ± 7.4"), (6962.4, 89.0, "6962.4 ± 89.0"), (0.0, 0.0, "0.00 ± 0.00"),
+        (0.00431, 0.000196, "0.00431 ± 0.00020"), (-0.0371, 0.006, "-0.0371 ± 0.0060"), (0.00431, 0.0, "0.00431 ± 0.00000"),
+        (1e-12, 2e-14, "0.000000000001000 ± 0.000000000000020"), (5.0, math.nan, "5.0 ± nan"),
+    ],
+)  # fmt: skip
+def test_digits_follow_the_interval(mean, half, text):
+    assert interval_text(Estimate(mean, half / 1.96, 100)) == text
+
+
+def test_digits_of_a_difference_are_its_own():
+    """Paired differences may be far smaller than costs vary; of equal policies they are those of the cost."""
+    cost = Estimate(15.0, 5.0, 100)
+    lines = [
+        table([Result("a", Comparison(cost, Estimate(mean, half / 1.96, 100), None))]).splitlines()[-1].split("|")[3].strip()
+        for mean, half in ((-0.0371, 0.006), (0.0, 0.0), (-375.5, 39.8), (0.5, 0.35))
+    ]
+    assert lines == ["-0.0371 ± 0.0060", "+0.0 ± 0.0", "-375.5 ± 39.8", "+0.50 ± 0.35"]
 
 
 @pytest.mark.parametrize("name", ["rule 2", "pAPI 2", "API two", "my API 2", "API 2 + one-at-a-time", "R-NT of API 2"])

@@ -13,6 +13,9 @@ __all__ = ["iteration_chart"]
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 480, 280, 82, 12, 14, 62
 
+# Numbers of more digits before the point are written with an exponent.
+_WRITTEN = 9
+
 
 def iteration_chart(costs: Sequence[tuple[str, Estimate]], rejected: Mapping[str, str]) -> str:
     """An SVG of discounted costs with their 95 % intervals, from left to right; of those that were not accepted hollow.
@@ -31,6 +34,7 @@ def iteration_chart(costs: Sequence[tuple[str, Estimate]], rejected: Mapping[str
     low = min(cost.mean - each for (_, cost), each in zip(costs, half, strict=True))
     high = max(cost.mean + each for (_, cost), each in zip(costs, half, strict=True))
     ticks = _ticks(low, high)
+    digits = _digits(ticks)
     low, high = min(low, ticks[0]), max(high, ticks[-1])
 
     def y(value: float) -> float:
@@ -39,7 +43,7 @@ def iteration_chart(costs: Sequence[tuple[str, Estimate]], rejected: Mapping[str
     step = (_WIDTH - _LEFT - _RIGHT) / len(costs)
     marks = [
         f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"/>'
-        f'<text x="{_LEFT - 8}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:g}</text>'
+        f'<text x="{_LEFT - 8}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:.{digits}g}</text>'
         for tick in ticks
     ]
     points = [(_LEFT + step * (number + 0.5), y(cost.mean)) for number, (_, cost) in enumerate(costs)]
@@ -71,4 +75,11 @@ def _ticks(low: float, high: float) -> list[float]:
     step = 10.0 ** math.floor(math.log10(span / 4))
     step *= next(factor for factor in (1, 2, 5, 10) if span / (step * factor) <= 6)
     first, last = math.floor(low / step), max(math.ceil(high / step), math.floor(low / step) + 1)
-    return [round(number * step, 10) for number in range(first, last + 1)]
+    return [number * step for number in range(first, last + 1)]
+
+
+def _digits(ticks: Sequence[float]) -> int:
+    """Digits that tell ticks apart, and write them out where that is not too long."""
+    largest = math.floor(math.log10(max(abs(ticks[0]), abs(ticks[-1]))))
+    apart = largest - math.floor(math.log10(ticks[1] - ticks[0])) + 1
+    return max(6, apart, largest + 1 if largest < _WRITTEN else 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from torchrl_pomdp.report.names import is_iteration, is_on_top, is_online
 from torchrl_pomdp.tensor_checks import check_tensor
 
 __all__ = ["Result", "half_width", "interval_text", "paired_ratios", "paired_table", "ratio_texts", "table"]
+
+_MOST_DECIMALS = 20
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ def table(results: Sequence[Result]) -> str:
     ]
     for result in check_sequence("results", results, Result):
         c = result.comparison
-        digits = _decimals(c.cost)
+        digits = _decimals(c.difference, _decimals(c.cost))
         lines.append(
             f"| {result.name} | {interval_text(c.cost)} | {c.difference.mean:+.{digits}f} ± "
             f"{half_width(c.difference):.{digits}f} | "
@@ -91,14 +94,19 @@ def interval_text(value: Estimate) -> str:
         '15.0 ± 9.8'
         >>> interval_text(Estimate(mean=-21.47, standard_error=0.06, count=1000))
         '-21.47 ± 0.12'
+        >>> interval_text(Estimate(mean=0.00431, standard_error=0.0001, count=100))
+        '0.00431 ± 0.00020'
     """
     digits = _decimals(check_instance("value", value, Estimate))
     return f"{value.mean:.{digits}f} ± {half_width(value):.{digits}f}"
 
 
-def _decimals(value: Estimate) -> int:
-    """Decimals that tell a mean from what it may also be."""
-    return 2 if half_width(value) < 1 else 1
+def _decimals(value: Estimate, least: int | None = None) -> int:
+    """Decimals that tell a mean from what it may also be: two digits of its half width, or three of a mean without one."""
+    half = half_width(value)
+    size = half or abs(value.mean) / 10
+    least = (2 if half < 1 else 1) if least is None else least
+    return max(least, min(_MOST_DECIMALS, 1 - math.floor(math.log10(size)))) if 0 < size < math.inf else least
 
 
 def paired_ratios(costs: Mapping[str, Tensor]) -> dict[str, dict[str, Estimate | None]]:
