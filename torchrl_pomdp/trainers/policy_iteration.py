@@ -131,7 +131,7 @@ class PolicyIteration:
         >>> config = PolicyIterationConfig(iterations=1, samples_per_part=40, least_steps=1, validation_states=50)
         >>> run = papi_nt(problem, config, GreedyRepair(problem.model))
         >>> [iteration.accepted for iteration in run], run.best is run.base_policy
-        ([False], True)
+        ([True], False)
     """
 
     def __init__(
