@@ -91,7 +91,8 @@ def test_refuses_nonsense(name, tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", CASES)
 def test_tries_every_argument(name, tmp_path):
     case = CASES[name](tmp_path)
-    parameters = inspect.signature(case.call).parameters.values()
+    # Ray adds a parameter to the methods of classes that it has run elsewhere.
+    parameters = [p for p in inspect.signature(case.call).parameters.values() if p.name != "_ray_trace_ctx"]
     assert {p.name for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)} <= set(case.arguments)
     assert {argument for argument, _ in case.hostile()} == set(case.arguments)
 
