@@ -70,7 +70,7 @@ class _Walk:
 
     def digest(self, value: Any) -> bytes:
         if type(value) in _PLAIN:
-            return _hash("plain", type(value).__name__, repr(value))
+            return hashed("plain", type(value).__name__, repr(value))
         known = self._known.get(id(value))
         if known is None:
             # What leads back to itself is told by the way there.
@@ -84,65 +84,65 @@ class _Walk:
             return _tensor(value)
         if isinstance(value, TensorDictBase):
             leaves = {str(key): value.get(key) for key in value.keys(include_nested=True, leaves_only=True)}
-            return _hash("tensordict", str(tuple(value.batch_size)), self._items(leaves))
+            return hashed("tensordict", str(tuple(value.batch_size)), self._items(leaves))
         if type(value) in (dict, types.MappingProxyType):
-            return _hash("mapping", self._items(value))
+            return hashed("mapping", self._items(value))
         if type(value) in (list, tuple):
-            return _hash(type(value).__name__, *map(self.digest, value))
+            return hashed(type(value).__name__, *map(self.digest, value))
         if type(value) in (set, frozenset):
-            return _hash("set", *sorted(map(self.digest, value)))
+            return hashed("set", *sorted(map(self.digest, value)))
         if isinstance(value, torch.device):
-            return _hash("device")
+            return hashed("device")
         if isinstance(value, torch.Generator):
-            return _hash("generator", _tensor(value.get_state()))
+            return hashed("generator", _tensor(value.get_state()))
         if isinstance(value, types.ModuleType):
-            return _hash("module", value.__name__)
+            return hashed("module", value.__name__)
         if isinstance(value, types.CodeType):
             return self._code(value)
         if isinstance(value, (staticmethod, classmethod, functools._lru_cache_wrapper)):
-            return _hash(type(value).__name__, self.digest(value.__wrapped__))
+            return hashed(type(value).__name__, self.digest(value.__wrapped__))
         if isinstance(value, property):
-            return _hash("property", *map(self.digest, (value.fget, value.fset)))
+            return hashed("property", *map(self.digest, (value.fget, value.fset)))
         if isinstance(value, functools.cached_property):
-            return _hash("property", self.digest(value.func))
+            return hashed("property", self.digest(value.func))
         if isinstance(value, _DESCRIPTORS):
-            return _hash("descriptor", value.__name__)
+            return hashed("descriptor", value.__name__)
         if isinstance(value, type):
             return self._class(value)
         if isinstance(value, types.FunctionType):
             return self._function(value)
         if isinstance(value, types.MethodType):
-            return _hash("method", *map(self.digest, (value.__func__, value.__self__)))
+            return hashed("method", *map(self.digest, (value.__func__, value.__self__)))
         if isinstance(value, types.BuiltinFunctionType):
             own = None if isinstance(value.__self__, types.ModuleType) else value.__self__
-            return _hash("builtin", _name(value), self.digest(own))
+            return hashed("builtin", _name(value), self.digest(own))
         if isinstance(value, (functools.partial, functools.partialmethod)):
-            return _hash("partial", *map(self.digest, (value.func, value.args, value.keywords)))
-        return _hash("object", self._class(type(value)), self._state(value))
+            return hashed("partial", *map(self.digest, (value.func, value.args, value.keywords)))
+        return hashed("object", self._class(type(value)), self._state(value))
 
     def _class(self, value: type) -> bytes:
         """A class by name, and by what it defines unless it is of a known package."""
         if _is_known(value):
-            return _hash("class", _name(value))
+            return hashed("class", _name(value))
         own = {name: entry for name, entry in vars(value).items() if name not in _SAYS_NOTHING}
-        return _hash("class", _name(value), *(self.digest(base) for base in value.__bases__), self._items(own))
+        return hashed("class", _name(value), *(self.digest(base) for base in value.__bases__), self._items(own))
 
     def _function(self, value: types.FunctionType) -> bytes:
         """A function by name, code, defaults, closure and the globals that it reads; of a known package by name and closure."""
         cells = [cell.cell_contents for cell in value.__closure__ or ()]
         bound = (value.__defaults__, value.__kwdefaults__, cells)
         if _is_known(value):
-            return _hash("function", _name(value), *map(self.digest, bound))
-        names = {name for code in _codes(value.__code__) for name in code.co_names}
+            return hashed("function", _name(value), *map(self.digest, bound))
+        names = {name for code in codes(value.__code__) for name in code.co_names}
         read = {name: value.__globals__[name] for name in names if name in value.__globals__}
         for name, module in [*read.items()]:
             if isinstance(module, types.ModuleType) and module.__name__.partition(".")[0] not in _KNOWN:
                 read |= {f"{name}.{entry}": getattr(module, entry) for entry in names if hasattr(module, entry)}
-        return _hash("function", _name(value), self._code(value.__code__), *map(self.digest, (*bound, read)))
+        return hashed("function", _name(value), self._code(value.__code__), *map(self.digest, (*bound, read)))
 
     def _code(self, code: types.CodeType) -> bytes:
         constants = [self._code(c) if isinstance(c, types.CodeType) else self.digest(c) for c in code.co_consts]
-        return _hash("code", code.co_code, repr((code.co_names, code.co_varnames)), *constants)
+        return hashed("code", code.co_code, repr((code.co_names, code.co_varnames)), *constants)
 
     def _state(self, value: Any) -> bytes:
         """What an object would be pickled by."""
@@ -164,20 +164,20 @@ class _Walk:
                 f"what a {_name(kind)} holds cannot be told, so no file can say that it belongs to it: {error}"
             ) from error
         if isinstance(reduced, str):
-            return _hash("named", reduced)
+            return hashed("named", reduced)
         make, given, state, *items = (*reduced, None)[:5]
         return self.digest([make, given, state, *(list(entries) for entries in items if entries is not None)])
 
     def _items(self, entries: Mapping[Any, Any]) -> bytes:
-        return _hash("items", *sorted(self.digest(key) + self.digest(entry) for key, entry in entries.items()))
+        return hashed("items", *sorted(self.digest(key) + self.digest(entry) for key, entry in entries.items()))
 
 
-def _codes(code: types.CodeType) -> Iterator[types.CodeType]:
+def codes(code: types.CodeType) -> Iterator[types.CodeType]:
     """A function's code and that of the functions in it."""
     yield code
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
-            yield from _codes(constant)
+            yield from codes(constant)
 
 
 def _is_known(value: Any) -> bool:
@@ -187,14 +187,15 @@ def _is_known(value: Any) -> bool:
 def _tensor(value: Tensor) -> bytes:
     flat = value.detach().cpu().contiguous().reshape(-1)
     content = flat.view(torch.uint8).numpy().data if flat.numel() else b""
-    return _hash("tensor", str(value.dtype), str(tuple(value.shape)), content)
+    return hashed("tensor", str(value.dtype), str(tuple(value.shape)), content)
 
 
 def _name(value: Any) -> str:
     return f"{value.__module__}.{value.__qualname__}"
 
 
-def _hash(*parts: str | bytes | memoryview) -> bytes:
+def hashed(*parts: str | bytes | memoryview) -> bytes:
+    """Hash of a list of parts, 16 bytes."""
     result = hashlib.blake2b(digest_size=16)
     for part in _encoded(parts):
         # With its length, so that no two lists of parts are one text.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Callable
 from functools import cache
@@ -13,7 +12,7 @@ from typing import Any
 from numba import njit, typeof
 from numba.core.dispatcher import Dispatcher
 
-from torchrl_pomdp.identity import digest
+from torchrl_pomdp.identity import codes, digest, hashed
 
 __all__ = ["OPTIONS", "Loops", "code_digest", "entry", "inner", "outer", "products", "shared"]
 
@@ -125,13 +124,13 @@ def _told(value: Any, seen: dict[FunctionType, int]) -> bytes:
     if function in seen:
         return str(seen[function]).encode()
     seen[function] = len(seen)
-    code, names = function.__code__, sorted(_names(function.__code__))
+    code, names = function.__code__, sorted({name for each in codes(function.__code__) for name in each.co_names})
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
     read = [(name, function.__globals__[name]) for name in names if name in function.__globals__]
     read += [*zip(code.co_freevars, cells, strict=True), ("", function.__defaults__)]
     read += sorted((function.__kwdefaults__ or {}).items())
     told = [part for name, each in read for part in (name.encode(), _read(each, names, seen))]
-    return _hash(f"{function.__module__}.{function.__qualname__}".encode(), _code(code), *told)
+    return hashed(f"{function.__module__}.{function.__qualname__}".encode(), _code(code), *told)
 
 
 def _read(value: Any, names: list[str], seen: dict[FunctionType, int]) -> bytes:
@@ -142,26 +141,15 @@ def _read(value: Any, names: list[str], seen: dict[FunctionType, int]) -> bytes:
         if value.__name__.partition(".")[0] in _BY_NAME:
             return value.__name__.encode()
         used = [name for name in names if hasattr(value, name)]
-        return _hash(*(part for name in used for part in (name.encode(), _read(getattr(value, name), names, seen))))
+        return hashed(*(part for name in used for part in (name.encode(), _read(getattr(value, name), names, seen))))
     if isinstance(value, type) and hasattr(value, "_fields"):
         return repr(value._fields).encode()
     if isinstance(value, tuple):
         fields = getattr(value, "_fields", None)
-        return _hash(repr(fields).encode(), *(_read(each, names, seen) for each in value))
+        return hashed(repr(fields).encode(), *(_read(each, names, seen) for each in value))
     return digest(value).encode()
-
-
-def _names(code: CodeType) -> set[str]:
-    """The names that a function's code uses, and that of the functions in it."""
-    inside = (_names(each) for each in code.co_consts if isinstance(each, CodeType))
-    return set(code.co_names).union(*inside)
 
 
 def _code(code: CodeType) -> bytes:
     constants = [_code(each) if isinstance(each, CodeType) else repr(each).encode() for each in code.co_consts]
-    return _hash(code.co_code, repr((code.co_names, code.co_varnames)).encode(), *constants)
-
-
-def _hash(*parts: bytes) -> bytes:
-    # With its length, so that no two lists of parts are one text.
-    return hashlib.sha256(b"".join(len(part).to_bytes(8, "little") + part for part in parts)).digest()
+    return hashed(code.co_code, repr((code.co_names, code.co_varnames)).encode(), *constants)

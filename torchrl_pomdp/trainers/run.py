@@ -311,7 +311,7 @@ class _Execution:
         path, owner = _costs_file(self.folder, name), _owner(self.identity, name)
         # A name does not say which networks it stands for: in an asynchronous run that depends on time.
         own, content = digest(policy), kept(path, owner)
-        if content is not None and content.get("policy") == own:
+        if content is not None and content["policy"] == own:
             return content["costs"]
         costs = discounted_costs(
             self.problem.model,
