@@ -70,6 +70,23 @@ def asks(n):
     return source["function"]
 
 
+def asks_within(n):
+    """A function that calls one of a module in another module, which knows that one."""
+    helpers, inner = types.ModuleType("helpers"), types.ModuleType("helpers.inner")
+    helpers.inner, inner.decide, inner.helpers = inner, adds(n), helpers
+    source = {"__name__": __name__, "helpers": helpers}
+    exec("def function(y):\n    return helpers.inner.decide(helpers, y)", source)
+    return source["function"]
+
+
+def calls_back(n):
+    """A function that calls two others, which call each other."""
+    source = {"__name__": __name__}
+    exec(f"def one(y):\n    return two(y)\ndef two(y):\n    return one(y + {n})", source)
+    exec("def function(y):\n    return one(y) + two(y)", source)
+    return source["function"]
+
+
 # Pairs of makers of what is equal to itself and differs from the other one.
 PAIRS = {
     "integers": (lambda: 1, lambda: 2),
@@ -124,6 +141,8 @@ PAIRS = {
     "objects of a class": (lambda: kind(n=1)(), lambda: kind(n=2)()),
     "cached helpers": (lambda: calls(1), lambda: calls(2)),
     "helpers of a module": (lambda: asks(1), lambda: asks(2)),
+    "helpers of a module in a module": (lambda: asks_within(1), lambda: asks_within(2)),
+    "functions that call each other": (lambda: calls_back(1), lambda: calls_back(2)),
     "named tuples": (lambda: Place(1), lambda: Place(2)),
 }
 
@@ -167,9 +186,10 @@ print(*(digest(make()) for name in NAMES for make in PAIRS[name]))
 """
 
 
-def test_digests_do_not_depend_on_the_process():
+@pytest.mark.parametrize("seed", ["1", "2"])
+def test_digests_do_not_depend_on_the_process(seed):
     script = SCRIPT.format(here=os.path.dirname(__file__))
-    env = os.environ | {"PYTHONHASHSEED": "123", "OMP_NUM_THREADS": "1"}
+    env = os.environ | {"PYTHONHASHSEED": seed, "OMP_NUM_THREADS": "1"}
     out = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, check=True).stdout
     assert out.split() == [digest(make()) for name in NAMES for make in PAIRS[name]]
 

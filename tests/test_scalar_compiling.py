@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
+import pickle
 import subprocess
 import sys
 import threading
@@ -16,9 +18,11 @@ import torch
 from numba.core.dispatcher import Dispatcher
 
 from torchrl_pomdp import noise
+from torchrl_pomdp.identity import digest
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.scalar import compiling, scalar_twin
 from torchrl_pomdp.scalar.compiling import code_digest, entry, inner, outer
+from torchrl_pomdp.scalar.models import _OPERATIONS, ScalarModel
 from torchrl_pomdp.scalar.noise import finished, fold, hash_numbers, hash_words, scenario_noise, uniform
 
 KEYS = noise.seed_keys(5, torch.arange(200))
@@ -177,6 +181,63 @@ def test_a_twin_that_changes_is_another_type():
         return twin
 
     assert make(0).type == make(0).type != make(1).type
+
+
+def test_policies_with_twins_have_digests_which_tell_their_twins_apart():
+    """The policy holds neither; its method reads them."""
+
+    def make(n):
+        called = inner(closure(n))
+
+        @scalar_twin
+        def twin(data, view, controls):
+            controls[0] = called(1)
+
+        return type("Policy", (), {"__module__": __name__, "scalar_engine": lambda self: twin, "other": lambda self: called})
+
+    texts = [digest(make(n)()) for n in (1, 1, 2)]
+    assert texts[0] == texts[1] != texts[2]
+    script = f"import sys; sys.path.insert(0, {os.path.dirname(__file__)!r}); from test_scalar_compiling import *\n"
+    assert in_another_process(script + "print(digest(Stays()))") == [digest(Stays())]
+
+
+def in_another_process(script, *args):
+    return subprocess.run([sys.executable, "-c", script, *args], capture_output=True, text=True, check=True).stdout.split()
+
+
+@scalar_twin
+def stay(data, view, controls):
+    controls[0] = 7
+
+
+ended = ScalarModel(**dict.fromkeys(_OPERATIONS, lambda data, state: state > data))
+
+
+class Stays:
+    def scalar_engine(self):
+        return stay, ended
+
+
+RECEIVED = """
+import pickle, sys
+import numpy as np
+from torchrl_pomdp.scalar.compiling import outer
+from torchrl_pomdp.scalar.models import over
+from torchrl_pomdp.scalar.twins import choose
+@outer
+def loop(policy, model, out):
+    choose(policy, (), out)
+    out[1], out[2] = over(model, 2), over(model, 4)
+twin, model = pickle.loads(bytes.fromhex(sys.argv[1]))
+out = np.zeros(3, np.int64)
+loop((twin, ()), (model, 3), out)
+print(*out)
+"""
+
+
+def test_twins_and_models_go_to_other_processes():
+    """The module that made them is not known there."""
+    assert in_another_process(RECEIVED, pickle.dumps((stay, ended)).hex()) == ["7", "0", "1"]
 
 
 def test_a_long_compilation_is_announced_and_a_short_one_is_not(caplog, monkeypatch):

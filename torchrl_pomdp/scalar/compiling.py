@@ -6,18 +6,14 @@ import logging
 from collections.abc import Callable
 from functools import cache
 from threading import Timer
-from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 from numba import njit, typeof
-from numba.core.dispatcher import Dispatcher
 
-from torchrl_pomdp.identity import codes, digest, hashed
+from torchrl_pomdp.identity import LIBRARIES, digest
 
 __all__ = ["OPTIONS", "Loops", "code_digest", "entry", "inner", "outer", "products", "shared"]
 
-# Of these packages functions are told by name: numba knows them, and what is kept on disk belongs to its version.
-_BY_NAME = {"math", "numba", "numpy"}
 _LOG = logging.getLogger(__name__)
 # A compilation that takes longer, in seconds, is announced.
 _SOON = 1.0
@@ -113,43 +109,4 @@ def code_digest(function: Any) -> str:
     Raises:
         TypeError: if it reads what cannot be told, such as an open file.
     """
-    return _told(function, {}).hex()[:16]
-
-
-def _told(value: Any, seen: dict[FunctionType, int]) -> bytes:
-    """Digest of a function, compiled or not; one that was met before is told by its number."""
-    function = value.py_func if isinstance(value, Dispatcher) else value
-    if not isinstance(function, FunctionType):
-        return digest(function).encode()
-    if function in seen:
-        return str(seen[function]).encode()
-    seen[function] = len(seen)
-    code, names = function.__code__, sorted({name for each in codes(function.__code__) for name in each.co_names})
-    cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    read = [(name, function.__globals__[name]) for name in names if name in function.__globals__]
-    read += [*zip(code.co_freevars, cells, strict=True), ("", function.__defaults__)]
-    read += sorted((function.__kwdefaults__ or {}).items())
-    told = [part for name, each in read for part in (name.encode(), _read(each, names, seen))]
-    return hashed(f"{function.__module__}.{function.__qualname__}".encode(), _code(code), *told)
-
-
-def _read(value: Any, names: list[str], seen: dict[FunctionType, int]) -> bytes:
-    """Digest of what a function reads that uses the given names, such as those of a module's attributes."""
-    if isinstance(value, (Dispatcher, FunctionType)):
-        return _told(value, seen)
-    if isinstance(value, ModuleType):
-        if value.__name__.partition(".")[0] in _BY_NAME:
-            return value.__name__.encode()
-        used = [name for name in names if hasattr(value, name)]
-        return hashed(*(part for name in used for part in (name.encode(), _read(getattr(value, name), names, seen))))
-    if isinstance(value, type) and hasattr(value, "_fields"):
-        return repr(value._fields).encode()
-    if isinstance(value, tuple):
-        fields = getattr(value, "_fields", None)
-        return hashed(repr(fields).encode(), *(_read(each, names, seen) for each in value))
-    return digest(value).encode()
-
-
-def _code(code: CodeType) -> bytes:
-    constants = [_code(each) if isinstance(each, CodeType) else repr(each).encode() for each in code.co_consts]
-    return hashed(code.co_code, repr((code.co_names, code.co_varnames)).encode(), *constants)
+    return digest(function, LIBRARIES)[:16]

@@ -52,8 +52,16 @@ class ScalarModel:
             raise ValueError(f"functions must be one for each of {sorted(_OPERATIONS)}, got a difference in {sorted(missing)}")
         found = {name: inner(function) for name, function in functions.items()}
         digests = "-".join(code_digest(function) for _, function in sorted(functions.items()))
-        self.type = ModelType(f"{functions['start'].__module__}-{digests}")
-        _MODELS[self.type.name] = found
+        self.__setstate__((f"{functions['start'].__module__}-{digests}", found))
+
+    def __getstate__(self) -> tuple[str, dict[str, Callable[..., Any]]]:
+        return self._key, _MODELS[self.type.name]
+
+    def __setstate__(self, state: tuple[str, dict[str, Callable[..., Any]]]) -> None:
+        # Compiled code finds the functions by the type, in another process too.
+        self._key, functions = state
+        self.type = ModelType(self._key)
+        _MODELS[self.type.name] = functions
 
 
 def start(model, state):

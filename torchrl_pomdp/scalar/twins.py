@@ -35,9 +35,17 @@ class ScalarTwin:
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self.function = inner(function)
+        compiled = inner(function)
         # Its name has been given the digest of its code.
-        self.type = TwinType(f"{function.__module__}.{function.__qualname__}")
+        self.__setstate__((f"{function.__module__}.{function.__qualname__}", compiled))
+
+    def __getstate__(self) -> tuple[str, Callable[..., Any]]:
+        return self._key, self.function
+
+    def __setstate__(self, state: tuple[str, Callable[..., Any]]) -> None:
+        # Compiled code finds it by its type, in another process too.
+        self._key, self.function = state
+        self.type = TwinType(self._key)
         _TWINS[self.type.name] = self.function
 
 
