@@ -9,8 +9,8 @@ from tensordict import TensorDict
 
 from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, UniformStart, damage_chain, grid, line
 from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
-from torchrl_pomdp.modules import RolloutPolicy, TruncatedRollout
-from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost
+from torchrl_pomdp.modules import AfterSteps, ConstantCost, OnEntering, RolloutPolicy, TruncatedRollout
+from torchrl_pomdp.modules.repair import GreedyRepair, NeverRepairCost, UrgencyRepair
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems import tiger
 
@@ -169,3 +169,22 @@ def test_bad_numbers_are_refused(line3):
         GreedyRepair(line3.model, damage_threshold=1.0)
     with pytest.raises(ValueError, match="robots must be 1 locations"):
         UniformStart(line3.model, (0, 1))
+
+
+FIXED = {
+    "damage_threshold": lambda model: GreedyRepair(model),
+    "exponent": lambda model: UrgencyRepair(model),
+    "cost": lambda model: ConstantCost(model, 1.0),
+    "m": lambda model: AfterSteps(3),
+    "parts": lambda model: OnEntering((1,)),
+    "max_steps": lambda model: TruncatedRollout(model, GreedyRepair(model)),
+}
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_numbers_that_loops_and_tables_have_read_stay(line3, name):
+    made = FIXED[name](line3.model)
+    before = getattr(made, name)
+    with pytest.raises(AttributeError):
+        setattr(made, name, 0)
+    assert getattr(made, name) == before

@@ -207,7 +207,7 @@ class TruncatedRollout(MakesItsOwn):
         else:
             check_policy("terminal_cost", terminal_cost, model)
         self.model, self.base_policy, self.truncation = model, base_policy, truncation
-        self.max_steps, self.terminal_cost, self.chunk_rows = max_steps, terminal_cost, chunk_rows
+        self._max_steps, self.terminal_cost, self.chunk_rows = max_steps, terminal_cost, chunk_rows
         self._compile = check_flag("compile", compile)
         powers = model.discount ** torch.arange(max_steps + 1, dtype=torch.float64)
         self.register_buffer("_discounts", powers.to(model.device, model.dtype), persistent=False)
@@ -229,6 +229,11 @@ class TruncatedRollout(MakesItsOwn):
     def _made_of(self) -> tuple[Any, ...]:
         """What the compiled loop is made of."""
         return self.truncation, self.terminal_cost, makeup(self.base_policy), makeup(self.terminal_cost)
+
+    @property
+    def max_steps(self) -> int:
+        """Largest number of steps; fixed, as discounts and compiled simulations are made for it."""
+        return self._max_steps
 
     def engine(self) -> ScalarEngine | None:
         """The compiled loop, made anew where modules, such as local networks and values, were replaced or got hooks."""

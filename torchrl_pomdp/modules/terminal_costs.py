@@ -63,7 +63,12 @@ class ConstantCost(ClosedFormCost):
         super().__init__()
         self.dtype = check_instance("model", model, BeliefModel).dtype
         self.in_keys = list(model.state_keys[:1])
-        self.cost = check_number("cost", cost, "(-inf, inf)")
+        self._cost = check_number("cost", cost, "(-inf, inf)")
+
+    @property
+    def cost(self) -> float:
+        """The number; fixed, as compiled simulations have read it."""
+        return self._cost
 
     def costs(self, y: TensorDictBase) -> Tensor:
         """The number, ``[*B]``."""

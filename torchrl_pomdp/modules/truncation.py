@@ -87,8 +87,13 @@ class AfterSteps(Truncation):
     """
 
     def __init__(self, m: int | Callable[[TensorDictBase], Tensor]) -> None:
-        self.m = m if callable(m) else check_integer("m", m, 0, 1 << 62)
+        self._m = m if callable(m) else check_integer("m", m, 0, 1 << 62)
         self.width = int(callable(m))
+
+    @property
+    def m(self) -> int | Callable[[TensorDictBase], Tensor]:
+        """The number of steps; fixed, as compiled simulations have read it."""
+        return self._m
 
     def start(self, y: TensorDictBase) -> Tensor:
         """The state-dependent m ``[N, 1]``; nothing ``[N, 0]`` where m is a number."""
@@ -130,9 +135,14 @@ class OnEntering(Truncation):
     def __init__(self, parts: Iterable[int]) -> None:
         if isinstance(parts, str) or not isinstance(parts, Iterable):
             raise TypeError(f"parts must be numbers of parts, got {shown(parts)}")
-        self.parts = tuple(sorted({check_integer("parts", part) for part in parts}))
+        self._parts = tuple(sorted({check_integer("parts", part) for part in parts}))
         if not self.parts or self.parts[0] < 0:
             raise ValueError(f"parts must hold at least one part and none below 0, got {self.parts}")
+
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """Numbers of the parts, in order; fixed, as compiled simulations have read them."""
+        return self._parts
 
     def stop(self, y: TensorDictBase, age: Tensor, memory: Tensor) -> Tensor:
         """Where the state is in one of the parts."""

@@ -47,12 +47,17 @@ class GreedyRepair(TensorDictModuleBase):
     def __init__(self, model: RepairModel, damage_threshold: float = 0.0) -> None:
         super().__init__()
         self.model = check_instance("model", model, RepairModel)
-        self.damage_threshold = check_number("damage_threshold", damage_threshold, "[0, 1)")
+        self._damage_threshold = check_number("damage_threshold", damage_threshold, "[0, 1)")
         size = model.num_locations
         # [L, L], target by origin: orders targets by distance, then index, and is below `size * size` for all.
         ranks = model.graph.distances.T * size + torch.arange(size).unsqueeze(-1)
         self.register_buffer("ranks", ranks.to(model.device, model.dtype), persistent=False)
         self.register_buffer("first_moves", first_moves(model), persistent=False)
+
+    @property
+    def damage_threshold(self) -> float:
+        """Probability of damage up to which a location counts as intact; fixed, as compiled simulations have read it."""
+        return self._damage_threshold
 
     def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
         """Compiled simulations, see :class:`~torchrl_pomdp.modules.scalar.ScalarEngine`."""
@@ -115,7 +120,7 @@ class UrgencyRepair(TensorDictModuleBase):
     def __init__(self, model: RepairModel, exponent: float = 3.0) -> None:
         super().__init__()
         self.model = check_instance("model", model, RepairModel)
-        self.exponent = check_number("exponent", exponent, "[0, inf)")
+        self._exponent = check_number("exponent", exponent, "[0, inf)")
         # What a level costs more than an intact location.
         costs = model.costs.double()
         self._prices = prices(costs - costs[..., :1])
@@ -125,6 +130,11 @@ class UrgencyRepair(TensorDictModuleBase):
         indices = torch.arange(model.num_locations, dtype=model.dtype, device=model.device).unsqueeze(-1)
         self.register_buffer("indices", indices, persistent=False)
         self.register_buffer("first_moves", first_moves(model), persistent=False)
+
+    @property
+    def exponent(self) -> float:
+        """How much the distance counts; fixed, as tables have been made with it."""
+        return self._exponent
 
     def scalar_engine(self, model: BeliefModel, limits: Limited) -> ScalarEngine | None:
         """Compiled simulations, see :class:`~torchrl_pomdp.modules.scalar.ScalarEngine`."""
