@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import copy
+import enum
 import functools
 import os
+import re
 import subprocess
 import sys
+import textwrap
 import threading
 import types
 from collections import deque
@@ -87,6 +90,65 @@ def calls_back(n):
     return source["function"]
 
 
+def imports(n):
+    """A function that imports what it calls."""
+    module = types.ModuleType("imported")
+    module.decide = adds(n)
+    sys.modules["imported"] = module
+    source = {}
+    exec("def function(y):\n    from imported import decide\n    return decide(y)", source)
+    return source["function"]
+
+
+def code(text):
+    source = {}
+    exec(f"def function(*y):\n{textwrap.indent(text, '    ')}", source)
+    return source["function"]
+
+
+def attribute(n):
+    """A function that reads its own attribute."""
+    function = code("return function.n")
+    function.n = n
+    return function
+
+
+def wrapped(n):
+    """A library's function in a user's."""
+
+    def twice(*y):
+        return torch.add(*y) * 2
+
+    def thrice(*y):
+        return torch.add(*y) * 3
+
+    return functools.wraps(torch.nn.functional.relu)(twice if n == 1 else thrice)
+
+
+class Node:
+    def __init__(self, control):
+        self.control, self.next = control, None
+
+
+def controller(last):
+    """A finite-state controller that plays 0, 1 and then what follows node ``last``."""
+    nodes = [Node(0), Node(1)]
+    nodes[0].next, nodes[1].next = nodes[1], nodes[last]
+    return nodes[0]
+
+
+class Mode(enum.Enum):
+    WAIT, GO, LOOK = range(3)
+
+
+def chain(n):
+    """Longer than Python calls functions within functions."""
+    first = None
+    for _ in range(2000):
+        first = [first]
+    return [n, first]
+
+
 # Pairs of makers of what is equal to itself and differs from the other one.
 PAIRS = {
     "integers": (lambda: 1, lambda: 2),
@@ -143,6 +205,22 @@ PAIRS = {
     "helpers of a module": (lambda: asks(1), lambda: asks(2)),
     "helpers of a module in a module": (lambda: asks_within(1), lambda: asks_within(2)),
     "functions that call each other": (lambda: calls_back(1), lambda: calls_back(2)),
+    "imported functions": (lambda: imports(1), lambda: imports(2)),
+    "arguments": (lambda: code("return y"), lambda: eval("lambda y: y")),
+    "what an exception ends": (
+        lambda: code("try:\n    print()\n    abs()\nexcept TypeError:\n    pass"),
+        lambda: code("print()\ntry:\n    abs()\nexcept TypeError:\n    pass"),
+    ),
+    "attributes of functions": (lambda: attribute(1), lambda: attribute(2)),
+    "wrapped functions": (lambda: wrapped(1), lambda: wrapped(2)),
+    "finite-state controllers": (lambda: controller(0), lambda: controller(1)),
+    "enumerations": (lambda: Mode.WAIT, lambda: Mode.GO),
+    "sets of an enumeration": (lambda: {Mode.WAIT, Mode.GO, Mode.LOOK}, lambda: {Mode.WAIT, Mode.GO}),
+    "chains": (lambda: chain(1), lambda: chain(2)),
+    "optional types": (lambda: kind(n=int | None), lambda: kind(n=str | None)),
+    "patterns": (lambda: re.compile("a"), lambda: re.compile("b")),
+    "sparse tensors": (lambda: torch.eye(2).to_sparse(), lambda: torch.eye(2)),
+    "functions by type": (lambda: functools.singledispatch(adds(1)), lambda: functools.singledispatch(adds(2))),
     "named tuples": (lambda: Place(1), lambda: Place(2)),
 }
 
@@ -167,6 +245,42 @@ def test_what_says_nothing_of_the_content_does_not_matter():
         before = digest(policy)
         policy(problem.start(torch.arange(2)))
         assert digest(policy) == before == digest(copy.deepcopy(policy)) == digest(policy.eval())
+
+
+class Cached:
+    @functools.cached_property
+    def table(self):
+        return torch.ones(2)
+
+
+def test_what_is_found_out_later_does_not_count():
+    """Cached properties, and what an enumeration remembers of its uses."""
+
+    class Flags(enum.Flag):
+        A, B = 1, 2
+
+    cached, model = Cached(), kind(table=Cached.table, n=1)()
+    before = digest([cached, model, Flags.A])
+    assert cached.table.sum() == 2
+    assert Flags.A | Flags.B
+    assert digest([cached, model, Flags.A]) == before
+    cached.other = 1
+    assert digest([cached, model, Flags.A]) != before
+
+
+def test_the_order_in_which_entries_were_made_does_not_matter():
+    one, two = (calls_back(n).__globals__ for n in (1, 2))
+    assert digest({"a": one["one"], "b": one["two"]}) == digest({"b": one["two"], "a": one["one"]})
+    assert digest({"a": one["one"], "b": one["two"]}) != digest({"a": two["one"], "b": two["two"]})
+
+
+def test_installed_packages_count_by_name_and_version(monkeypatch):
+    networkx = pytest.importorskip("networkx")
+    graph = networkx.path_graph(3)
+    before = digest(graph)
+    assert before == digest(networkx.path_graph(3)) != digest(networkx.path_graph(4))
+    monkeypatch.setattr(networkx, "__version__", "0")
+    assert digest(graph) != before
 
 
 def test_content_that_leads_back_to_itself_has_a_digest():

@@ -12,6 +12,7 @@ import threading
 from types import ModuleType
 from typing import NamedTuple
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -24,6 +25,7 @@ from torchrl_pomdp.scalar import compiling, scalar_twin
 from torchrl_pomdp.scalar.compiling import code_digest, entry, inner, outer
 from torchrl_pomdp.scalar.models import _OPERATIONS, ScalarModel
 from torchrl_pomdp.scalar.noise import finished, fold, hash_numbers, hash_words, scenario_noise, uniform
+from torchrl_pomdp.scalar.twins import choose
 
 KEYS = noise.seed_keys(5, torch.arange(200))
 
@@ -233,6 +235,42 @@ out = np.zeros(3, np.int64)
 loop((twin, ()), (model, 3), out)
 print(*out)
 """
+
+
+def test_compiled_functions_read_globals_as_they_are_when_they_are_made():
+    """As their digests do, by which they are kept on disk."""
+    source = {"__name__": __name__, "scalar_twin": scalar_twin, "extra": 1}
+    exec("def twin(data, view, controls):\n    controls[0] = extra", source)
+    policy, out = scalar_twin(source["twin"]), np.zeros(1, np.int64)
+    source["extra"] = 2
+    chosen((policy, ()), out)
+    assert out[0] == 1
+    chosen((scalar_twin(source["twin"]), ()), out)
+    assert out[0] == 2
+
+
+@outer
+def chosen(policy, out):
+    choose(policy, (), out)
+
+
+def test_a_compiled_function_may_call_itself():
+    source = {"__name__": __name__}
+    exec("def sums(n):\n    return n + sums(n - 1) if n > 0 else 0", source)
+    assert outer(source["sums"])(4) == 10
+
+
+def test_the_digest_of_a_compiled_function_does_not_depend_on_how_often_it_was_compiled():
+    first, second = inner(closure(1)), inner(closure(1))
+    assert digest(first) == digest(second)
+    assert first.__qualname__ == second.__qualname__
+    function = closure(1)
+    assert inner(function).__qualname__ == inner(function).__qualname__
+
+
+def test_options_of_compiling_count():
+    function = closure(1)
+    assert len({code_digest(made) for made in (numba.njit(function), numba.njit(fastmath=True)(function), function)}) == 3
 
 
 def test_twins_and_models_go_to_other_processes():

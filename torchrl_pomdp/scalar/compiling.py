@@ -6,11 +6,13 @@ import logging
 from collections.abc import Callable
 from functools import cache
 from threading import Timer
+from types import FunctionType
 from typing import Any
 
 from numba import njit, typeof
 
-from torchrl_pomdp.identity import LIBRARIES, digest
+from torchrl_pomdp.checks import check_instance
+from torchrl_pomdp.identity import digest
 
 __all__ = ["OPTIONS", "Loops", "code_digest", "entry", "inner", "outer", "products", "shared"]
 
@@ -51,6 +53,7 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
     They are kept by name, which a digest of the code in them makes another one when that changes.
     """
+    function = _as_it_is(check_instance("function", function, FunctionType))
     # Names of files may not be long.
     function.__qualname__ = f"{function.__name__[:64]}_{code_digest(function)}"
     compiled: Callable[..., Any]
@@ -59,7 +62,20 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
     except RuntimeError:
         # There is no folder that can be written: each process compiles for itself.
         compiled = njit(**options)(function)
+    if "." not in function.__code__.co_qualname:
+        # It may call itself.
+        function.__globals__[function.__name__] = compiled
     return compiled
+
+
+def _as_it_is(function: FunctionType) -> FunctionType:
+    """A copy that reads globals as they are now: numba reads them when it compiles, which is later than the digest."""
+    copy = FunctionType(
+        function.__code__, {**function.__globals__}, function.__name__, function.__defaults__, function.__closure__
+    )
+    copy.__kwdefaults__, copy.__module__, copy.__doc__ = function.__kwdefaults__, function.__module__, function.__doc__
+    copy.__dict__.update(function.__dict__)
+    return copy
 
 
 def entry(function: Any, *args: Any) -> Callable[..., Any]:
@@ -109,4 +125,4 @@ def code_digest(function: Any) -> str:
     Raises:
         TypeError: if it reads what cannot be told, such as an open file.
     """
-    return digest(function, LIBRARIES)[:16]
+    return digest(function, libraries=True)[:16]

@@ -51,7 +51,7 @@ class ScalarModel:
         if missing:
             raise ValueError(f"functions must be one for each of {sorted(_OPERATIONS)}, got a difference in {sorted(missing)}")
         found = {name: inner(function) for name, function in functions.items()}
-        digests = "-".join(code_digest(function) for _, function in sorted(functions.items()))
+        digests = "-".join(code_digest(function) for _, function in sorted(found.items()))
         self.__setstate__((f"{functions['start'].__module__}-{digests}", found))
 
     def __getstate__(self) -> tuple[str, dict[str, Callable[..., Any]]]:

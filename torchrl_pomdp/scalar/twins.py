@@ -36,8 +36,8 @@ class ScalarTwin:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         compiled = inner(function)
-        # Its name has been given the digest of its code.
-        self.__setstate__((f"{function.__module__}.{function.__qualname__}", compiled))
+        # Its name has the digest of its code.
+        self.__setstate__((f"{compiled.__module__}.{compiled.__qualname__}", compiled))
 
     def __getstate__(self) -> tuple[str, Callable[..., Any]]:
         return self._key, self.function
