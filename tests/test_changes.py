@@ -51,8 +51,13 @@ def test_gains_are_paired_with_the_old_policy(wall):
 def test_the_command_writes_a_table(wall, tmp_path, capsys):
     assert cli.main(["changes", "--states", "4", "--trajectories", "2", "--out", str(tmp_path)]) == 0
     text = (tmp_path / "changes" / "model-changes.md").read_text()
-    assert text.startswith("a wall, 4 start states, ratios to the old policy")
+    assert text.startswith("a wall, 4 start states, 2 trajectories of each control, ratios to the old policy")
     assert "| rollout of it |" in text
     assert text.strip() in capsys.readouterr().out
-    assert cli.main(["changes", "--states", "1", "--out", str(tmp_path)]) == 2
+    assert cli.main(["changes", "--states", "4", "--trajectories", "2", "--out", str(tmp_path)]) == 0
+    for more in (["--states", "4", "--trajectories", "3"], ["--states", "5", "--trajectories", "2"]):
+        assert cli.main(["changes", *more, "--out", str(tmp_path)]) == 2
+        assert "holds another measurement, not of" in capsys.readouterr().err
+    assert (tmp_path / "changes" / "model-changes.md").read_text() == text
+    assert cli.main(["changes", "--states", "1", "--out", str(tmp_path / "other")]) == 2
     assert "states must be at least 2, got 1" in capsys.readouterr().err

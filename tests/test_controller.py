@@ -7,9 +7,10 @@ from itertools import product
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Binary
 
 from torchrl_pomdp.controller import Controller, Decision
-from torchrl_pomdp.envs import SinglePart
+from torchrl_pomdp.envs import SinglePart, TabularModel
 from torchrl_pomdp.envs.repair import RepairModel, damage_chain, line
 from torchrl_pomdp.modules import Myopic, RolloutPolicy
 from torchrl_pomdp.modules.repair import GreedyRepair
@@ -261,6 +262,24 @@ def test_a_state_in_a_file_gives_the_same_decisions(dtype):
         first.update(first.act().control, None)
 
 
+def test_truth_values_are_part_of_a_state():
+    class Lamp(TabularModel):
+        state_keys = ("belief", "on")
+
+        def state_spec(self, batch_size=()):
+            spec = super().state_spec(batch_size)
+            return spec.set("on", Binary(shape=batch_size, dtype=torch.bool))
+
+    model = Lamp(torch.ones(1, 1, 1), torch.ones(1, 1, 1), torch.ones(1, 1), 0.9)
+    first, second = (Controller(model, lambda y: y.set("action", torch.zeros(y.batch_size, dtype=torch.int64))) for _ in "ab")
+    first.reset(TensorDict({"belief": torch.ones(1), "on": torch.tensor(True)}))
+    second.load_json(first.to_json())
+    assert second.state["on"].dtype == torch.bool
+    assert bool(second.state["on"])
+    with pytest.raises(ValueError, match=r"on must hold numbers of type torch\.bool, got 1"):
+        second.load_json(first.to_json().replace("true", "1"))
+
+
 def test_a_model_that_no_text_can_tell_is_named():
     class Locked(RepairModel):
         def __init__(self, *args):
@@ -287,6 +306,8 @@ def test_a_checkpoint_becomes_a_controller(tmp_path, online):
     controller = Controller.from_checkpoint(tmp_path / "policy.pt", online=online)
     given = controller.policy
     assert isinstance(given, RolloutPolicy) == online
+    # As evaluations measure it: nothing is added where simulations end.
+    assert not online or given.cost_to_go.terminal_cost is None
     trained = given.cost_to_go.base_policy if online else given
     y = problem.model.with_features(problem.start(torch.arange(20)))
     assert torch.equal(trained(y.copy())["action"], policy(y.copy())["action"])

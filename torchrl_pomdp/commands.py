@@ -17,6 +17,7 @@ from torchrl_pomdp.checks import check_integer, check_seed
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES, PolicyIterationConfig
 from torchrl_pomdp.envs import BeliefEnv
 from torchrl_pomdp.envs.repair import RepairModel, save_animation, trajectory_figure
+from torchrl_pomdp.envs.repair.rendering.animation import check_film
 from torchrl_pomdp.evaluation import Comparison, discounted_costs
 from torchrl_pomdp.evaluation import compare as compare_costs
 from torchrl_pomdp.files import check_folder, read_json, write_bytes, write_json
@@ -174,7 +175,7 @@ def compare(command: Compare) -> None:
     _check_same(out / f"{name}.json", about)
     outcomes = compare_peers(
         problem,
-        runs / name,
+        runs / f"{name}-seed{command.seed}",
         checkpoint=given,
         ppo_steps=None if command.checkpoint is None or given is None else _ppo_steps(command.checkpoint.parent, given),
         methods=command.methods,
@@ -209,7 +210,10 @@ def _check_same(path: Path, command: dict[str, Any]) -> None:
 
 def changes(command: Changes) -> None:
     """Measure all changes of models; print the table and write it."""
-    out = check_folder("out", command.out) / "changes"
+    path = check_folder("out", command.out) / "changes" / "model-changes.md"
+    numbers = f"{command.states} start states, {command.trajectories} trajectories of each control"
+    if path.is_file() and numbers not in path.read_text().partition("\n")[0]:
+        raise ValueError(f"out must be another folder: {path} holds another measurement, not of {numbers}")
     found = measure_changes(
         command.states,
         trajectories=command.trajectories,
@@ -217,12 +221,12 @@ def changes(command: Changes) -> None:
         progress=True,
     )
     tables = [
-        f"{change}, {command.states} start states, ratios to the old policy\n\n"
+        f"{change}, {numbers}, ratios to the old policy\n\n"
         + table([Result(policy, comparison) for policy, comparison in policies.items()])
         for change, policies in found.items()
     ]
     text = "\n\n".join(tables)
-    write_bytes(out / "model-changes.md", f"{text}\n".encode())
+    write_bytes(path, f"{text}\n".encode())
     print(f"\n{text}\n", flush=True)
 
 
@@ -272,8 +276,7 @@ def report(command: Report) -> None:
     if command.animation is None:
         print(f"report: {write_report(command.run, problem=given)}")
         return
-    if command.animation.suffix.lower() not in (".gif", ".mp4"):
-        raise ValueError(f"animation must end in .gif or .mp4, got {str(command.animation)!r}")
+    check_film("animation", command.animation)
     run = read_run_folder(command.run, given)
     if run.policy is None:
         raise ValueError(f"animation needs a policy of the run. {run.missing}")

@@ -102,7 +102,8 @@ class Controller:
         checkpoint = load_checkpoint(path, problem=problem, device=device)
         model, policy = checkpoint.problem.model, checkpoint.policy
         if online:
-            policy = r_nt(checkpoint.problem, policy, terminal_cost=checkpoint.problem.pessimistic_cost)
+            # The policy that evaluations measure.
+            policy = r_nt(checkpoint.problem, policy)
         return cls(model, policy)
 
     # ---- the loop ------------------------------------------------------------------------------------------------------
@@ -256,6 +257,6 @@ class Controller:
 def _tensor(name: str, numbers: Any, dtype: torch.dtype) -> Tensor:
     """Numbers of a text as a tensor; what is no number of the type is not made one."""
     found = torch.tensor(numbers)
-    if found.dtype == torch.bool or (found.is_floating_point() and not dtype.is_floating_point):
+    if (found.dtype == torch.bool) != (dtype == torch.bool) or (found.is_floating_point() and not dtype.is_floating_point):
         raise ValueError(f"{name} must hold numbers of type {dtype}, got {shown(numbers)}")
     return torch.tensor(numbers, dtype=dtype)

@@ -5,12 +5,13 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import PendulumEnv
 
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement
 from torchrl_pomdp.envs import BeliefEnv, FixedBelief
-from torchrl_pomdp.modules import FlatEncoder, PolicyNetwork, RolloutPolicy, ZeroCost
+from torchrl_pomdp.modules import FlatEncoder, MultistepLookahead, PolicyNetwork, RolloutPolicy, ZeroCost
 from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import make_problem, tiger
 
@@ -136,6 +137,24 @@ def test_tabular_models_are_labelled_by_the_same_collector():
     batch = next(iter(source))
     assert batch["action"].tolist() == [0] * 4, "listening beats opening a door blindly"
     assert batch["q_factors"].shape == (4, 3)
+
+
+@pytest.mark.parametrize("counts", [True, False])
+def test_any_module_makes_labels(counts):
+    """Lookahead of several steps; one that counts no simulated steps."""
+    problem = tiger()
+
+    def label(model, policy):
+        if counts:
+            return MultistepLookahead(RolloutPolicy(model, policy, trajectories=2))
+        return TensorDictModule(lambda belief: (belief[..., 0].long(), belief), ["belief"], ["action", "q_factors"])
+
+    listen, starts = problem.base_policies["listen"], problem.start
+    source = RolloutImprovement(
+        BeliefEnv(problem.model, starts), listen, states=starts, frames_per_batch=4, total_frames=4, label=label
+    )
+    assert next(iter(source))["action"].tolist() == [0] * 4
+    assert (source.simulated_steps > 0) == counts
 
 
 def test_other_environments_are_refused():

@@ -119,3 +119,26 @@ def test_what_cannot_be_checked_is_refused():
         check_partition(tiger.model, tiger.start, num_states=0)
     with pytest.raises(ValueError, match="action 5 at batch index"):
         check_partition(tiger.model, tiger.start, lambda y: y.set("action", y["partition"] + 5))
+
+
+def test_random_controls_do_not_depend_on_how_the_start_was_drawn(linear20, monkeypatch):
+    """Where a robot stands says nothing of what it draws: half of those inside the line that do not repair go left."""
+    seen, advance = [], type(linear20.model).advance
+
+    def looked_at(model, y, u, noise):
+        seen.append((y.clone(), u))
+        return advance(model, y, u, noise)
+
+    monkeypatch.setattr(type(linear20.model), "advance", looked_at)
+    check_partition(linear20.model, linear20.start, num_states=4000, max_steps=1)
+    ((y, u),) = seen
+    place = y["location"][:, 0]
+    for part in (place.ge(1) & place.lt(10), place.ge(10) & place.lt(19)):
+        left = (u[part & (u != 0)] == 1).double().mean()
+        assert 0.44 < left < 0.56
+
+
+def test_many_robots_choose_each_for_itself():
+    problem = make_problem("network32x8")
+    report = check_partition(problem.model, problem.start, num_states=20, max_steps=3)
+    assert sum(map(sum, report.transitions)) == 60

@@ -12,11 +12,13 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
 
 from torchrl_pomdp.envs.gym import BeliefSimulation, PomdpEnv, WorldSimulation
+from torchrl_pomdp.envs.gym.spaces import entry_array
 from torchrl_pomdp.envs.repair import RepairModel, damage_chain, line
 from torchrl_pomdp.problems import Problem, make_problem
 
@@ -167,6 +169,12 @@ def test_bounds_hold_where_rounding_passes_them(dtype):
     assert observation["belief"].dtype == np.float32
     assert observation["belief"].max() == 1.0
     assert observation in env.observation_space
+
+
+def test_entries_without_a_shape_of_their_own_lie_in_the_space():
+    box, bits, count = spaces.Box(0.0, 1.0, (), np.float32), spaces.MultiBinary(()), spaces.Discrete(3)
+    for space, leaf in ((box, torch.tensor(0.5)), (bits, torch.tensor(True)), (count, torch.tensor(2))):
+        assert space.contains(entry_array(space, leaf))
 
 
 def test_what_is_seen_is_the_agents_own():

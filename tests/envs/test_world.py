@@ -14,9 +14,10 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_pomdp.envs import BeliefEnv, FixedBelief, SinglePart, TabularModel, TrackBelief, WorldEnv
+from torchrl_pomdp.envs import BeliefEnv, FixedBelief, Mixture, SinglePart, TabularModel, TrackBelief, WorldEnv
 from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, damage_chain, line
 from torchrl_pomdp.modules.repair import GreedyRepair
+from torchrl_pomdp.noise import uniform
 from torchrl_pomdp.problems import make_problem, tiger
 
 NAMES = ("line3", "linear20", "two_robots20", "rocksample7x8", "maintenance3", "tiger")
@@ -346,3 +347,19 @@ def test_costs_that_are_no_numbers_are_refused():
     env = WorldEnv(model, CalibratedStart(model), batch_size=(40,), seed=0)
     with pytest.raises(ValueError, match="cost of the world must be finite, got inf"):
         env.rollout(5, break_when_any_done=False)
+
+
+def test_the_hidden_state_does_not_depend_on_how_the_start_was_drawn():
+    """Of a mixture, whose generators draw from keys of their own."""
+    problem, keys = make_problem("tiger"), torch.arange(8000)
+
+    def start(keys):
+        p = uniform(keys, 0)
+        return TensorDict({"belief": torch.stack([1 - p, p], -1)}, keys.shape)
+
+    for generator in (start, Mixture([start], [1.0])):
+        y = generator(keys)
+        hidden, p = problem.model.world().sample(y, keys)["state"], y["belief"][:, 1]
+        for low in (0.0, 0.25, 0.5, 0.75):
+            share = hidden[(p >= low) & (p < low + 0.25)].double().mean()
+            assert share == pytest.approx(low + 0.125, abs=0.04)

@@ -158,3 +158,20 @@ def test_an_actor_draws_legal_controls_by_the_softmax_of_the_logits(linear20):
     assert bool(((counts / 4000 - probs).abs() <= 4.5 * (probs * (1 - probs) / 4000).sqrt() + 1e-6).all())
     exact = logits.log_softmax(-1).repeat_interleave(4000, 0).gather(-1, drawn["action"].unsqueeze(-1)).squeeze(-1)
     torch.testing.assert_close(drawn["action_log_prob"], exact)
+
+
+def test_a_value_reads_what_its_scale_reads(linear20):
+    """The encoder reads the robot's location alone, the scale the belief."""
+
+    class Place(FlatEncoder):
+        def encode_rows(self, y, rows):
+            place = y["location"] if rows is None else y["location"][rows]
+            return torch.nn.functional.one_hot(place[:, 0], 20).to(self.dtype)
+
+    encoder = Place(linear20.model)
+    encoder.keys, encoder.num_features = ["location"], 20
+    network = ValueNetwork(encoder, NeverRepairCost(linear20.model), (4,), generator=torch.Generator().manual_seed(0))
+    assert network.in_keys == ["location", "belief"]
+    y = linear20.model.with_features(linear20.start(torch.arange(9)))
+    value = network(y.select("location", "belief"))["state_value"]
+    assert torch.equal(PartitionedValue([network] * 6)(y)["state_value"], value)

@@ -8,7 +8,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from torchrl_pomdp.modules import FlatEncoder, MultistepLookahead, PolicyNetwork, RolloutPolicy
 from torchrl_pomdp.objectives import ClassificationLoss
+from torchrl_pomdp.problems import tiger
 
 
 class Logits(TensorDictModuleBase):
@@ -114,3 +116,26 @@ def test_one_legal_control_or_equal_costs_give_finite_losses():
 def test_unknown_losses_are_refused():
     with pytest.raises(ValueError, match="loss must be one of"):
         ClassificationLoss(Logits([0.0]), "hinge")
+
+
+@pytest.mark.parametrize("loss", ["soft", "cost_weighted", "advantage", "l2", "cross_entropy"])
+def test_dominated_controls_are_not_learnt_as_good_ones(loss):
+    """Lookahead with a margin gives them no Q-factor though they are legal."""
+    problem = tiger()
+    labeller = MultistepLookahead(RolloutPolicy(problem.model, problem.base_policies["listen"]), margin=0.0)
+    batch = labeller(problem.model.with_features(problem.start(torch.arange(2))))
+    assert batch["q_factors"].isinf().sum() == 4
+    network = PolicyNetwork(FlatEncoder(problem.model), 3, generator=torch.Generator().manual_seed(0))
+    if loss in ("l2", "cross_entropy"):
+        found = ClassificationLoss(network, loss)(batch)
+        assert found["loss_policy"].isfinite()
+        assert found["regret"] == 0
+        return
+    with pytest.raises(ValueError, match=f"q_factors of legal controls must be finite for loss='{loss}', got \\+inf"):
+        ClassificationLoss(network, loss)(batch)
+
+
+def test_the_regret_of_a_dominated_control_is_at_least_the_largest_known():
+    given = batch()
+    given["q_factors"][1, 2], given["action_mask"] = math.inf, torch.ones(2, 3, dtype=torch.bool)
+    assert ClassificationLoss(Logits([0.0, 0.0, 9.0]), "l2")(given)["regret"] == (16 + 3) / 2

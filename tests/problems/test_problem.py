@@ -11,8 +11,9 @@ from torchrl_pomdp.cli import main
 from torchrl_pomdp.envs import FixedBelief, TabularModel
 from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, line
 from torchrl_pomdp.evaluation import discounted_costs
+from torchrl_pomdp.modules import ConstantCost
 from torchrl_pomdp.modules.repair import GreedyRepair
-from torchrl_pomdp.problems import Problem, make_problem
+from torchrl_pomdp.problems import Problem, make_problem, tiger
 
 
 def test_what_an_evaluation_cuts_does_not_outweigh_small_costs(capsys):
@@ -52,3 +53,19 @@ def test_a_problem_without_a_known_bound_finds_one(robots):
     model = RepairModel(line(4), damage_chain((0.0, 0.5)), (0.0, 1.0, 5.0), 0.9, num_robots=robots)
     problem = Problem(model, UniformStart(model, robots=(0,) * robots), base_policies={"greedy": GreedyRepair(model)})
     assert 100.0 < problem.pessimistic_cost.cost < 200.1
+
+
+def test_pessimistic_costs_are_positive():
+    problem = tiger()
+    with pytest.raises(ValueError, match=r"pessimistic_cost must be positive, .* got -5\.0 in a start state"):
+        replace(problem, pessimistic_cost=ConstantCost(problem.model, -5.0), spec=None)
+    assert replace(problem, pessimistic_cost=ConstantCost(problem.model, 5.0), spec=None).pessimistic_cost.cost == 5.0
+
+
+@pytest.mark.parametrize("name", ["action", "cost", "next", "hidden", "q_factors"])
+def test_entries_have_no_names_of_what_stands_beside_them(name):
+    class Named(TabularModel):
+        state_keys = ("belief", name)
+
+    with pytest.raises(ValueError, match=f"state_keys must not hold names of what stands beside a state, got {name}"):
+        Named(torch.ones(1, 1, 1), torch.ones(1, 1, 1), torch.ones(1, 1), 0.9)

@@ -23,7 +23,7 @@ from torchrl_pomdp.envs.repair import (
     line,
 )
 from torchrl_pomdp.modules import AfterSteps, ConstantCost, OnEntering, OnLeaving
-from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder, UrgencyRepair
+from torchrl_pomdp.modules.repair import GreedyRepair, RelativeEncoder, RobotEncoder, UrgencyRepair
 from torchrl_pomdp.problems import Problem, make_problem
 from torchrl_pomdp.problems.problem import identity_symmetry
 from torchrl_pomdp.trainers import Evaluate, Improve, PolicyIteration, PolicyIterationConfig
@@ -117,7 +117,8 @@ OTHERS = {
     "symmetries": ({"mine": lambda: replace(problem(), symmetries=(identity_symmetry, lambda y: y))}, "symmetries"),
     "pessimistic cost": ({"mine": lambda: replace(problem(), pessimistic_cost=ConstantCost(problem().model, 9.0))},
                          "pessimistic_cost"),
-    "encoder": ({"mine": lambda: replace(problem(), encoder=RelativeEncoder)}, "encoder"),
+    "encoder": ({"mine": lambda: replace(problem(), encoder=RelativeEncoder)}, "encoders"),
+    "encoder of many agents": ({"mine": lambda: replace(problem(), agent_encoder=RobotEncoder)}, "encoders"),
     "base policy": ({"base": UrgencyRepair}, "base_policy"),
     "base policy's threshold": ({"base": lambda model: GreedyRepair(model, 0.3)}, "base_policy"),
     "seed": ({"config": replace(CONFIG, seed=1)}, "config"),

@@ -222,7 +222,7 @@ def test_the_command_writes_over_no_other_results(line3, checkpoint, tmp_path, c
     before = {file.name: file.read_bytes() for file in path.parent.iterdir()}
     others = {
         "states": {"states": 4, "runs": "more"},
-        "seed": {"more": ("--seed", "5"), "runs": "more"},
+        "seed": {"more": ("--seed", "5")},
         "checkpoint, policy": {"more": ("--checkpoint", str(tmp_path / "best.pt"))},
     }
     for name, options in others.items():

@@ -14,6 +14,7 @@ from torchrl_pomdp.envs import BeliefEnv, InPart
 from torchrl_pomdp.envs.repair import RandomState, RepairModel, RepairPartition, UniformStart, damage_chain, line
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import (
+    FlatEncoder,
     OnEntering,
     PartitionedPolicy,
     PolicyCost,
@@ -418,3 +419,31 @@ def test_a_model_without_a_partition_has_a_single_part():
     assert problem.partition.names == ("all",)
     assert model.partition is None, "the user's own model is left alone"
     assert [step.parts for step in papi_nt(problem, TINY, GreedyRepair(model)).plan] == [(0,)]
+
+
+def test_encoders_with_weights_are_refused(line3, tmp_path):
+    """All networks share the encoder: one that is trained would change the others."""
+
+    class Trained(FlatEncoder):
+        def __init__(self, model):
+            super().__init__(model)
+            self.layer = torch.nn.Linear(3, 3)
+
+    class Kept(FlatEncoder):
+        def __init__(self, model):
+            super().__init__(model)
+            self.register_buffer("scale", torch.ones(3))
+
+    for kind, named in ((Trained, "layer.bias, layer.weight"), (Kept, "scale")):
+        with pytest.raises(ValueError, match=f"encoder must have no weights of its own, .* got {named}"):
+            list(papi_nt(replace(line3, encoder=kind, spec=None), TINY, GreedyRepair(line3.model), folder=tmp_path / "run"))
+
+
+def test_it_trains_where_gradients_are_switched_off(line3):
+    config = replace(TINY, iterations=1, samples_per_part=20, least_steps=1, validation_states=20)
+    base = GreedyRepair(line3.model)
+    with torch.no_grad():
+        (one,) = papi_nt(line3, config, base)
+    (other,) = papi_nt(line3, config, base)
+    for a, b in zip(one.policy.parameters(), other.policy.parameters(), strict=True):
+        assert torch.equal(a, b)

@@ -244,12 +244,21 @@ def label_states(shared: tuple[Any, ...], numbers: Tensor) -> tuple[TensorDictBa
         numbers: numbers of the states, ``[N]``.
     """
     model, labeller, states, summary = shared
-    before, begin = labeller.simulated_steps, time.perf_counter()
+    before, begin = _steps(labeller), time.perf_counter()
     with torch.no_grad():
         block = labeller(model.derive(model.drawn(states, numbers, "states")))
     seconds = time.perf_counter() - begin
-    report = {"simulated_steps": labeller.simulated_steps - before, "seconds": seconds, "summary": summary and summary(block)}
+    report = {
+        "simulated_steps": _steps(labeller) - before,
+        "seconds": seconds,
+        "summary": summary and summary(block),
+    }
     return block, report
+
+
+def _steps(labeller: TensorDictModuleBase) -> int:
+    """Belief steps that a labelling module has simulated so far; none where it does not count."""
+    return int(getattr(labeller, "simulated_steps", 0))
 
 
 def _environment(create_env_fn: Any) -> BeliefEnv:

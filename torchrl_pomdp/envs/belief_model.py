@@ -19,7 +19,7 @@ from torchrl.data import Binary, Categorical, Composite
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_number, check_sequence, shown
 from torchrl_pomdp.envs.controls import JointControls, check_index
-from torchrl_pomdp.envs.entries import check_state_entries
+from torchrl_pomdp.envs.entries import RESERVED, check_state_entries
 from torchrl_pomdp.envs.names import name_of, number_of
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.rows import inverse_cdf
@@ -84,6 +84,10 @@ class BeliefModel(JointControls, ABC):
     def __init__(self, discount: float, partition: Partition | None = None) -> None:
         super().__init__()
         self.discount = check_number("discount", discount, "(0, 1)")
+        keys = getattr(self, "state_keys", ())
+        taken = sorted(RESERVED.intersection(keys if isinstance(keys, tuple) else ()))
+        if taken:
+            raise ValueError(f"state_keys must not hold names of what stands beside a state, got {', '.join(taken)}")
         if partition is not None:
             self.check_partition(partition)
         self.partition = partition

@@ -10,7 +10,14 @@ from torchrl.data import Composite
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.tensor_checks import bounds_text, within
 
-__all__ = ["check_state_entries"]
+__all__ = ["RESERVED", "check_state_entries"]
+
+RESERVED = frozenset(
+    {"action", "action_mask", "partition", "logits", "q_factors", "state_value", "cost", "hidden", "told", "priority", "part"}
+    | {"next", "reward", "done", "terminated", "truncated", "step_count", "_reset", "collector", "traj_ids"}
+    | {"advantage", "value_target", "action_log_prob"}
+)
+"""What stands beside a state's entries in the TensorDicts of this library and of TorchRL: no entry has such a name."""
 
 
 def check_state_entries(name: str, value: Any, spec: Composite, kind: str) -> TensorDictBase:

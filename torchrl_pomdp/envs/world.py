@@ -23,7 +23,7 @@ __all__ = ["World"]
 
 # What a key's independent streams of uniforms are for, beside those of the generators of feature states: the key that made a
 # start state may also draw the hidden state behind it.
-_SAMPLE, _STEP = 10, 11
+_STEP, _SAMPLE = 11, 13
 
 
 class World(ABC):

@@ -126,7 +126,8 @@ class AgentNetwork(LocalNetwork):
         if not sizes:
             raise ValueError("hidden must hold at least one size, got none")
         super().__init__(encoder, [*sizes, model.num_agent_controls], generator)
-        self.in_keys = list(encoder.keys)
+        # Legal controls are told by the core.
+        self.in_keys = [*dict.fromkeys((*encoder.keys, *model.state_keys))]
         bound = (encoder.num_features + encoder.num_own + encoder.num_marks) ** -0.5
         for name, count in (("own", encoder.num_own), ("marks", encoder.num_marks)):
             weight = torch.empty(count, sizes[0], dtype=encoder.dtype, device=generator.device)

@@ -68,6 +68,11 @@ class MultistepLookahead(TensorDictModuleBase):
         self.margin = None if margin is None else check_number("margin", margin, "[0, inf)")
         self.model, self.in_keys = policy.model, policy.in_keys
 
+    @property
+    def simulated_steps(self) -> int:
+        """Belief steps simulated so far, see :class:`~torchrl_pomdp.modules.TruncatedRollout`."""
+        return self.policy.simulated_steps
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"q_factors"`` ``[*B, U]``, see :meth:`q_factors`, and ``"action"`` ``[*B]`` (ties to the lower)."""
         q = self.q_factors(tensordict)

@@ -194,7 +194,8 @@ class ValueNetwork(LocalNetwork):
         check_instance("scale", scale, ClosedFormCost)
         super().__init__(encoder, [*check_sizes("hidden", hidden), 1], generator)
         self.scale = scale
-        self.in_keys = self.entry_keys = list(encoder.keys)
+        self.entry_keys = list(scale.in_keys)
+        self.in_keys = [*dict.fromkeys((*encoder.keys, *self.entry_keys))]
 
     @property
     def kind(self) -> tuple[Any, ...]:

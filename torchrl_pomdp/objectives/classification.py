@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_choice, check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.agents import AgentNetwork
+from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.partitioned import PartitionedPolicy
 from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, with_weights, without_modes
 
@@ -55,7 +56,8 @@ class ClassificationLoss(LabelLoss):
     Raises:
         TypeError: if an argument is of the wrong kind.
         ValueError: if ``loss`` is unknown; by ``forward``, if a label is missing, illegal or no number, or the loss is not
-            finite.
+            finite; if a legal control has the Q-factor ``+inf``, as a dominated one, and the loss is not ``"l2"`` or
+            ``"cross_entropy"``.
 
     Examples:
         >>> import torch
@@ -112,12 +114,14 @@ class ClassificationLoss(LabelLoss):
         # Each agent's decision is a row.
         label, q_factors, logits = label.flatten(), q_factors.flatten(0, -2), logits.flatten(0, -2)
         gaps = _gaps(q_factors, label)
+        if self.loss in _BY_COST and isinstance(network, LocalNetwork):
+            _check_all_told(q_factors, logits, self.loss)
         chosen = logits.detach().argmax(-1)
         return TensorDict(
             {
                 "loss_policy": check_loss("loss_policy", _LOSSES[self.loss](logits, label, gaps).mean()),
                 "accuracy": (chosen == label).to(logits.dtype).mean(),
-                "regret": gaps.gather(-1, chosen.unsqueeze(-1)).mean(),
+                "regret": _missed(q_factors, gaps).gather(-1, chosen.unsqueeze(-1)).mean(),
             }
         )
 
@@ -138,6 +142,20 @@ def _gaps(q_factors: Tensor, label: Tensor) -> Tensor:
     if not bool(((label >= 0) & (label < q_factors.shape[-1])).all()) or bool(illegal.gather(-1, label.unsqueeze(-1)).any()):
         raise ValueError("action must be a legal control, one with a finite Q-factor, got another")
     return gaps
+
+
+def _check_all_told(q_factors: Tensor, logits: Tensor, loss: str) -> None:
+    """Raise if a legal control, one with a finite logit, has no Q-factor."""
+    if bool((torch.isposinf(q_factors) & torch.isfinite(logits)).any()):
+        raise ValueError(
+            f"q_factors of legal controls must be finite for loss={loss!r}, got +inf: lookahead with a margin leaves out "
+            "dominated controls; label with margin=None, or learn the control alone, by 'l2' or 'cross_entropy'"
+        )
+
+
+def _missed(q_factors: Tensor, gaps: Tensor) -> Tensor:
+    """Gaps, at least the largest one for dominated controls, whose Q-factors are not known."""
+    return torch.where(torch.isposinf(q_factors), gaps.amax(-1, keepdim=True), gaps)
 
 
 def _l2(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:
@@ -171,6 +189,8 @@ def _advantage(logits: Tensor, label: Tensor, gaps: Tensor) -> Tensor:
     return (error / count).sum(-1)
 
 
+# Losses that learn from Q-factors; the others learn the control.
+_BY_COST = ("soft", "cost_weighted", "advantage")
 _LOSSES = {
     "soft": _soft,
     "l2": _l2,

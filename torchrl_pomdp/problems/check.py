@@ -12,6 +12,7 @@ from torchrl.data import Composite
 
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, shown
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
+from torchrl_pomdp.envs.entries import RESERVED
 from torchrl_pomdp.envs.rows import random_control
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems.check_laws import (
@@ -101,6 +102,8 @@ def _check_attributes(model: BeliefModel) -> None:
     keys: Any = getattr(model, "state_keys", None)
     named = isinstance(keys, tuple) and len(keys) > 0 and all(isinstance(key, str) for key in keys)
     require(named, "state_keys", "it is a tuple of the names of core entries", shown(keys), "Set it in the class.")
+    taken = sorted(RESERVED.intersection(keys))
+    require(not taken, "state_keys", "none is the name of what stands beside a state", str(taken), "Name them otherwise.")
     for name, count in (("control_names", model.num_controls), ("observation_names", model.num_observations)):
         names = getattr(model, name)
         right = names is None or (isinstance(names, tuple) and len(names) == len(set(names)) == count)

@@ -19,8 +19,8 @@ from torchrl_pomdp.noise import fold, seed_keys, uniform
 
 __all__ = ["PartitionReport", "check_partition"]
 
-# What the uniforms of a trajectory are for.
-_START, _STEP, _CONTROL = 0, 1, 2
+# What the uniforms of a trajectory are for; those of its stages are no start state's.
+_START, _STAGES, _STEP, _CONTROL = range(4)
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _counts(
     for step in range(max_steps):
         if not len(keys):
             break
-        now = fold(keys, step)
+        now = fold(fold(keys, _STAGES), step)
         u = choose(y, fold(now, _CONTROL))
         model.check_controls(y, u)
         noise = uniform(fold(now, _STEP).unsqueeze(-1), torch.arange(model.noise_dim, device=keys.device))
@@ -169,6 +169,10 @@ def _number(model: BeliefModel, part: Tensor) -> Tensor:
 
 def _random_controls(model: BeliefModel) -> Callable[[TensorDictBase, Tensor], Tensor]:
     def choose(y: TensorDictBase, keys: Tensor) -> Tensor:
-        return random_control(y.get("action_mask"), uniform(keys, 0))
+        numbers = uniform(keys, 0)
+        if not model.enumerable:
+            # Each agent chooses for itself.
+            numbers = uniform(keys.unsqueeze(-1), torch.arange(model.num_agents, device=keys.device))
+        return random_control(y.get("action_mask"), numbers)
 
     return choose

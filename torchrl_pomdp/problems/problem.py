@@ -32,7 +32,7 @@ Symmetry = Callable[[TensorDictBase], TensorDictBase]
 _STATES = 2048
 # And so many joint controls of each, where there are too many to try them all.
 _DRAWS = 32
-# Start states of which the first symmetry shows that it is the identity.
+# Start states that show whether the first symmetry is the identity, and whether pessimistic costs are positive.
 _IMAGES = 16
 # Stands for what is made of the model.
 _DEFAULT: Any = None
@@ -114,6 +114,7 @@ class Problem:
             bound = model.max_cost if model.max_cost is not None else _largest_cost(model, self.start)
             self._set(pessimistic_cost=ConstantCost(model, (bound or 1.0) / (1.0 - model.discount)))
         check_instance("pessimistic_cost", self.pessimistic_cost, ClosedFormCost)
+        _check_positive(self.pessimistic_cost, self.start, model.device)
 
     @property
     def evaluation_cost(self) -> ClosedFormCost:
@@ -166,6 +167,16 @@ class Problem:
         spec = None if self.spec is None else {**self.spec, "partitioned": False}
         training = (Mixture(self.training, [1.0] * len(self.training)),)
         return replace(self, model=self.model.with_partition(SinglePart()), training=training, spec=spec)
+
+
+def _check_positive(cost: ClosedFormCost, start: StateGenerator, device: torch.device) -> None:
+    """Raise if some of the start states have negative pessimistic costs; terminal ones may have none."""
+    costs = cost.costs(start(torch.arange(_IMAGES, device=device)))
+    if bool((costs < 0).any()):
+        raise ValueError(
+            f"pessimistic_cost must be positive, as networks' values are multiples of it, got {float(costs.min())} in a start "
+            "state; where costs are negative rewards, a bound of their size will do"
+        )
 
 
 def _checked_policies(policies: Any, model: BeliefModel) -> dict[str, TensorDictModuleBase]:

@@ -50,7 +50,7 @@ def problem_from_spec(spec: Mapping[str, Any], *, device: torch.device | str = "
     Args:
         spec: one of ``preset``, the name of a known problem, with its options beside it; ``repair``, a table of graph, chain,
             costs, discount and more; ``tabular``, a table of arrays; ``pomdp``, the text of a file ``.POMDP``. Beside it
-            ``name``, and ``partitioned``, false for a single part. See the documentation of problem files.
+            ``name``, and ``partitioned``, false for a single part. The how-to page on problems of one's own shows all entries.
 
     Keyword Args:
         device: where the model computes.

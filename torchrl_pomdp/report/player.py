@@ -31,7 +31,7 @@ def lookahead(problem: Problem, base: Policy) -> Any:
 
     if not problem.model.enumerable or problem.model.num_controls > MOST_CONTROLS:
         return None
-    return r_nt(problem, base, trajectories=_TRAJECTORIES, terminal_cost=problem.pessimistic_cost)
+    return r_nt(problem, base, trajectories=_TRAJECTORIES)
 
 
 def starts(problem: Problem, count: int) -> tuple[TensorDictBase, torch.Tensor]:

@@ -2,7 +2,7 @@ r"""Untrained partitioned networks, as a configuration describes them (paper, Se
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -23,7 +23,10 @@ from torchrl_pomdp.modules import (
 )
 from torchrl_pomdp.problems.problem import Problem
 
-__all__ = ["is_multiagent", "make_agent_encoder", "make_encoder", "make_networks", "make_values"]
+__all__ = ["is_multiagent", "make_agent_encoder", "make_encoder", "make_networks", "make_values", "weightless"]
+
+
+_E = TypeVar("_E", bound=Encoder)
 
 
 def is_multiagent(problem: Problem, config: PolicyIterationConfig) -> bool:
@@ -33,12 +36,16 @@ def is_multiagent(problem: Problem, config: PolicyIterationConfig) -> bool:
 
 def make_encoder(problem: Problem, config: PolicyIterationConfig) -> Encoder:
     """The encoder that the configuration names: the problem's own, or the flat one."""
-    return problem.encoder(problem.model) if config.encoder == "own" else FlatEncoder(problem.model)
+    if config.encoder != "own":
+        return FlatEncoder(problem.model)
+    return weightless(check_instance("encoder", problem.encoder(problem.model), Encoder))
 
 
 def make_agent_encoder(problem: Problem, config: PolicyIterationConfig) -> AgentEncoder:
     """The encoder of a network that many agents share: the problem's own, or the flat one."""
-    return problem.agent_encoder(problem.model) if config.encoder == "own" else FlatAgentEncoder(problem.model)
+    if config.encoder != "own":
+        return FlatAgentEncoder(problem.model)
+    return weightless(check_instance("encoder", problem.agent_encoder(problem.model), AgentEncoder))
 
 
 def make_networks(
@@ -117,4 +124,15 @@ def _checked(problem: Any, config: Any, seed: Any, encoder: Any) -> tuple[Belief
     check_seed("seed", seed)
     if encoder is None:
         encoder = make_encoder(problem, config)
-    return problem.model, check_instance("encoder", encoder, Encoder)
+    return problem.model, weightless(check_instance("encoder", encoder, Encoder))
+
+
+def weightless(encoder: _E) -> _E:
+    """An encoder that all networks share: training one would change the others, and checkpoints keep none of its weights."""
+    kept = sorted(encoder.state_dict())
+    if kept:
+        raise ValueError(
+            f"encoder must have no weights of its own, and only buffers that are not persistent: got {', '.join(kept)}; layers "
+            "to be trained belong into the network"
+        )
+    return encoder

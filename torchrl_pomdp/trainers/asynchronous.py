@@ -173,7 +173,6 @@ class AsynchronousIteration:
             self._restore(run.folder, state)
         best_costs = run._validate(run.base_policy, "base policy")
         run._visit(run.base_policy, 0)
-        run._make_encoders()
         threads = [
             threading.Thread(target=self._improve, args=(part, state), daemon=True) for part in range(len(state.networks))
         ]

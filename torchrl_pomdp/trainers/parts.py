@@ -277,7 +277,7 @@ def train_part(
     trainer.register_op("process_optim_batch", lambda batch: buffer.sample().to(device))
     begin = time.perf_counter()
     # Products of a few rows are slower with several threads than with one, and sums of gradients would depend on their number.
-    with kept_threads(1):
+    with kept_threads(1), torch.enable_grad():
         trainer.train()
     return time.perf_counter() - begin, stepper.final()
 

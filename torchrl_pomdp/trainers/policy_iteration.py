@@ -14,7 +14,7 @@ import math
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -54,6 +54,7 @@ from torchrl_pomdp.trainers.architecture import (
     make_encoder,
     make_networks,
     make_values,
+    weightless,
 )
 from torchrl_pomdp.trainers.logs import clear_log
 from torchrl_pomdp.trainers.parts import PartImages, PartJob, PartRecord, records_text, text_records
@@ -164,23 +165,18 @@ class PolicyIteration:
         symmetries = problem.symmetries[: None if config.symmetries and not keep_order else 1]
         self._images = PartImages(self.partition, symmetries)
         self._multiagent = is_multiagent(problem, config)
+        self._encoder = self._shared_encoder()
+        # Value networks share the policy networks' encoder where these see the state as they do.
+        self._value_encoder = make_encoder(problem, config) if self._multiagent else self._encoder
         self._start()
 
-    @cached_property
-    def _encoder(self) -> Encoder:
-        """What the policy networks share."""
-        if self._multiagent:
-            return _shared_encoder(self._base, AgentNetwork) or make_agent_encoder(self.problem, self.config)
-        return _shared_encoder(self._base, PolicyNetwork) or make_encoder(self.problem, self.config)
-
-    @cached_property
-    def _value_encoder(self) -> Encoder:
-        """What the value networks share: the policy networks' where these see the state as they do."""
-        return make_encoder(self.problem, self.config) if self._multiagent else self._encoder
-
-    def _make_encoders(self) -> None:
-        """Make the encoders now, for those who ask for them at the same time."""
-        _ = self._encoder, self._value_encoder
+    def _shared_encoder(self) -> Encoder:
+        """What the policy networks share, the base policy's own too."""
+        kind = AgentNetwork if self._multiagent else PolicyNetwork
+        of_base = next((policy.encoder for policy in self._base if isinstance(policy, kind)), None)
+        if of_base is not None:
+            return weightless(of_base)
+        return (make_agent_encoder if self._multiagent else make_encoder)(self.problem, self.config)
 
     def _start(self) -> None:
         self.best: TensorDictModuleBase = self.base_policy
@@ -220,7 +216,7 @@ class PolicyIteration:
             "training": [identity(generator) for generator in problem.training],
             "pessimistic_cost": identity(problem.pessimistic_cost),
             "symmetries": [identity(symmetry) for symmetry in problem.symmetries],
-            "encoder": identity(problem.agent_encoder if self.config.multiagent else problem.encoder),
+            "encoders": [identity(problem.encoder), identity(problem.agent_encoder)],
             "base_policy": identity(self.base_policy),
             "plan": [[type(s).__name__, s.parts, None if s.truncation is None else identity(s.truncation)] for s in self.plan],
             "config": asdict(self.config),
@@ -392,8 +388,3 @@ def judge(comparison: Comparison) -> tuple[bool, str]:
         f"cost {verdict}: {comparison.difference.mean:+.4g} ({low:+.4g} … {high:+.4g}) against the best policy so far{ratio}, "
         f"on {comparison.cost.count} validation states"
     )
-
-
-def _shared_encoder(local: Sequence[TensorDictModuleBase], kind: type[LocalNetwork]) -> Encoder | None:
-    """The encoder of the networks of a kind among local policies, if there are any."""
-    return next((p.encoder for p in local if isinstance(p, kind)), None)

@@ -203,6 +203,17 @@ def test_an_animation_has_a_frame_for_every_state(tmp_path):
     assert (tmp_path / "again.gif").read_bytes() == path.read_bytes()
 
 
+def test_trajectories_may_show_different_things(tmp_path):
+    """The truth of one, the Q-factors of the other."""
+    model = robots(line(3))
+    true = play(model, GreedyRepair(model), state(model, 0), torch.tensor(7), max_steps=2)
+    assert true.get("hidden", None) is not None
+    decided = played(model, 2).set("q_factors", torch.zeros(2, 3))
+    for trajectories in ({"a": true, "b": decided}, {"b": decided, "a": true}):
+        save_animation(tmp_path / "a.gif", model, trajectories)
+        assert (tmp_path / "a.gif").is_file()
+
+
 def test_frames_show_stages_costs_and_controls(monkeypatch):
     model = robots(grid(3, 3), num_robots=2)
     trajectories = {"base": played(model, 2), "rollout": played(model, 4, seed=1)}

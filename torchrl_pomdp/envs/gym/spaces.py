@@ -61,7 +61,7 @@ def count_space(base: int, count: int) -> spaces.Discrete | spaces.MultiDiscrete
 
 
 def entry_array(space: spaces.Space, leaf: Tensor) -> Any:
-    """A new array of the space's type, or a NumPy number; the tensor has any batch in front.
+    """A new array of the space's type, a NumPy number where it is discrete; the tensor has any batch in front.
 
     Rounding, of sums of probabilities or to float32, may pass the bounds of a box: such numbers are put on them.
 
@@ -71,8 +71,8 @@ def entry_array(space: spaces.Space, leaf: Tensor) -> Any:
     """
     array = leaf.detach().cpu().numpy().astype(space.dtype, order="C")
     if isinstance(space, spaces.Box):
-        array = np.clip(array, space.low, space.high)
-    return array if array.ndim else array[()]
+        array = np.asarray(np.clip(array, space.low, space.high))
+    return array[()] if isinstance(space, spaces.Discrete) and not array.ndim else array
 
 
 # ---- controls ----------------------------------------------------------------------------------------------------------

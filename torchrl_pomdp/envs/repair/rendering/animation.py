@@ -31,6 +31,8 @@ _DPI, _COLOURS, _FILM_DPI = 80, 160, 120
 # Milliseconds that the last frame of a GIF stays longer.
 _PAUSE = 2000
 _BAR = "#9aa5b1"
+# What may be shown of a trajectory, from top to bottom.
+_KINDS = ("belief", "truth", "bars")
 
 
 def save_animation(
@@ -79,9 +81,7 @@ def save_animation(
         ...     (Path(folder) / "greedy.gif").read_bytes()[:6]
         b'GIF89a'
     """
-    path = check_path("path", path)
-    if path.suffix.lower() not in (".gif", ".mp4"):
-        raise ValueError(f"path must end in .gif or .mp4, got {str(path)!r}")
+    path = check_film("path", path)
     check_instance("model", model, RepairModel)
     check_mapping("trajectories", trajectories, TensorDictBase)
     if not 1 <= len(trajectories) <= _MOST:
@@ -91,6 +91,19 @@ def save_animation(
     figure, panels = _panels(model, shown)
     frames = _frames(model, panels, shown)
     write_bytes(path, _gif(figure, frames, pace) if path.suffix.lower() == ".gif" else _mp4(figure, frames, pace))
+
+
+def check_film(name: str, path: str | PathLike[str]) -> Path:
+    """The path of an animation; raises unless it ends as one, and what writes it is installed."""
+    file = check_path(name, path)
+    if file.suffix.lower() not in (".gif", ".mp4"):
+        raise ValueError(f"{name} must end in .gif or .mp4, got {str(path)!r}")
+    if file.suffix.lower() == ".mp4":
+        from matplotlib.animation import FFMpegWriter
+
+        if not FFMpegWriter.isAvailable():
+            raise ValueError(f"{name} ends in .mp4, which needs the program ffmpeg: install it, or name a .gif")
+    return file
 
 
 def _gif(figure: Figure, frames: Iterator[None], pace: float) -> bytes:
@@ -122,8 +135,6 @@ def _mp4(figure: Figure, frames: Iterator[None], pace: float) -> bytes:
     """An MP4 of a figure as it is after each of the frames."""
     from matplotlib.animation import FFMpegWriter
 
-    if not FFMpegWriter.isAvailable():
-        raise ValueError("path ends in .mp4, which needs the program ffmpeg: install it, or name a .gif")
     # Any rate will do for ffmpeg.
     rate: Any = pace
     # Players want frames of even width and height, and this format of pixels.
@@ -139,12 +150,12 @@ def _mp4(figure: Figure, frames: Iterator[None], pace: float) -> bytes:
 
 def _kinds(each: Played) -> list[str]:
     """The panels of a trajectory, from top to bottom."""
-    return ["belief"] + ["truth"] * (each.truth is not None) + ["bars"] * (each.bars is not None)
+    return [kind for kind in _KINDS if kind == "belief" or getattr(each, kind) is not None]
 
 
 def _panels(model: RepairModel, trajectories: Sequence[Played]) -> tuple[Figure, list[dict[str, Axes]]]:
     """A figure with the empty panels of each trajectory, by kind."""
-    every = max(map(_kinds, trajectories), key=len)
+    every = [kind for kind in _KINDS if any(kind in _kinds(each) for each in trajectories)]
     panels = [(number, kind) for kind in every for number in range(len(trajectories))]
     columns = len(trajectories) if len(trajectories) > 1 else len(every)
     if is_wide(model):
