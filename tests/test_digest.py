@@ -77,8 +77,8 @@ def asks_within(n):
     """A function that calls one of a module in another module, which knows that one."""
     helpers, inner = types.ModuleType("helpers"), types.ModuleType("helpers.inner")
     helpers.inner, inner.decide, inner.helpers = inner, adds(n), helpers
-    source = {"__name__": __name__, "helpers": helpers}
-    exec("def function(y):\n    return helpers.inner.decide(helpers, y)", source)
+    source = {"__name__": __name__, "helpers": helpers, "inner": inner}
+    exec("def function(y):\n    return helpers.inner.decide(helpers, inner.decide(y))", source)
     return source["function"]
 
 

@@ -251,7 +251,8 @@ class _Graph:
     def _read(self, function: types.FunctionType) -> dict[str, Any]:
         """What a function reads: globals, what it imports, and what it may use of these modules."""
         every = [*_codes(function.__code__)]
-        names = {name for code in every for name in code.co_names}
+        # In an order of its own: that of a set is another one in each process.
+        names = sorted({name for code in every for name in code.co_names})
         read = {name: function.__globals__[name] for name in names if name in function.__globals__}
         for code in every:
             read |= {f"import {way}": module for way, module in self._imports(code, function.__globals__)}
