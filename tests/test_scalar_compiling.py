@@ -249,6 +249,15 @@ def test_compiled_functions_read_globals_as_they_are_when_they_are_made():
     assert out[0] == 2
 
 
+def test_what_a_compiled_function_reads_is_defined_above_it():
+    source = {"__name__": __name__}
+    exec("def twin(data, view, controls):\n    controls[0] = later(1)", source)
+    with pytest.raises(NameError, match="twin reads later, which must be defined above it"):
+        scalar_twin(source["twin"])
+    with pytest.raises(TypeError, match="function must be a function"):
+        scalar_twin(3)
+
+
 @outer
 def chosen(policy, out):
     choose(policy, (), out)

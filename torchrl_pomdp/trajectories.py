@@ -6,10 +6,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_instance, check_integer
+from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.world import World
-from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, check_policy, controls_of
+from torchrl_pomdp.modules.rollout import Policy, check_max_steps, check_policy, controls_of
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import check_keys
 
@@ -76,7 +76,7 @@ def play(
     """
     world = model.world() if has_world(model) else None
     check_policy("policy", policy, model)
-    max_steps = check_integer("max_steps", model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
+    max_steps = check_max_steps(max_steps, model)
     y = model.with_features(y)
     if check_keys("keys", keys).shape != y.batch_size:
         raise ValueError(f"keys must be one for each state, of shape {tuple(y.batch_size)}, got {tuple(keys.shape)}")

@@ -10,10 +10,10 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_pomdp.envs import TabularModel
-from torchrl_pomdp.envs.repair import UniformStart, joint_belief, tabular_model
+from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, joint_belief, line, tabular_model
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import Myopic
-from torchrl_pomdp.modules.repair import UrgencyRepair
+from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.planners import DESPOT, POMCP, solve, tree_search
 from torchrl_pomdp.planners import despot as despot_module
 from torchrl_pomdp.problems import make_problem
@@ -346,3 +346,29 @@ def test_a_long_exploration_ends_with_the_time(linear20, monkeypatch):
     monkeypatch.setattr(despot_module, "perf_counter", lambda: 0.0)
     search(y.clone())
     assert search.simulated_steps - before - little > 3 * little
+
+
+@pytest.mark.parametrize(("epsilon", "damage"), [(0.01, 0.005), (1e-6, 5e-7)])
+def test_damage_too_improbable_to_go_on_for_is_not_charged(epsilon, damage):
+    """All is over once the first location is repaired: the last one, far away, is never seen."""
+    costs = (0.0, 0.1, 1.0, 10.0, 100.0)
+    model = RepairModel(line(6), damage_chain((0.0, 0.02, 0.03, 0.05)), costs, 0.99, terminal_probability=epsilon)
+    belief = torch.zeros(1, 6, 5)
+    belief[..., 0] = 1.0
+    belief[0, 0] = torch.tensor([0.0, 1.0, 0.0, 0.0, 0.0])
+    belief[0, 5] = torch.tensor([1 - damage, 0.0, 0.0, 0.0, damage])
+    y = TensorDict({"belief": belief, "location": torch.zeros(1, 1, dtype=torch.int64)}, [1])
+    search = DESPOT(model, GreedyRepair(model), simulations=50, scenarios=20)
+    assert search(y.clone())["action"] == 0
+    low, high = (float(bound) for bound in search.bounds(y))
+    paid = 0.1 + 100 * damage
+    assert low <= paid * (1 + 1e-6)
+    assert high == pytest.approx(paid, rel=1e-4)
+
+
+def test_all_is_over_once_nothing_is_damaged_though_level_0_costs():
+    model = RepairModel(line(2), damage_chain((0.0,)), (10.0, 11.0), 0.9)
+    y = TensorDict({"belief": torch.tensor([[0.0, 1.0], [1.0, 0.0]]), "location": torch.tensor([0])}, [])
+    found = solve(tabular_model(model), joint_belief(model, y))
+    assert list(found.interval) == pytest.approx([21.0, 21.0], rel=0.005)
+    assert DESPOT(model, GreedyRepair(model), simulations=20)(y[None])["q_factors"].min() == 21.0

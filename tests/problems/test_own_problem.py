@@ -7,16 +7,19 @@ import shlex
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
 from torchrl_pomdp.cli import main
 from torchrl_pomdp.envs import FixedBelief, Partition, TabularModel
+from torchrl_pomdp.envs.repair import damage_chain, grid, line
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.files import DamagedFileError
-from torchrl_pomdp.modules import PolicyNetwork
-from torchrl_pomdp.problems import Problem, make_problem
+from torchrl_pomdp.modules import PolicyNetwork, RolloutPolicy
+from torchrl_pomdp.planners import POMCP
+from torchrl_pomdp.problems import Problem, make_problem, repair_problem, tiger
 from torchrl_pomdp.trainers import (
     Checkpoint,
     PolicyIterationConfig,
@@ -216,3 +219,18 @@ def test_what_a_problem_must_be():
     ]:
         with pytest.raises((TypeError, ValueError), match=message):
             Problem(model, start, **wrong)
+
+
+@pytest.mark.parametrize("graph", [line(1), line(2), grid(1, 6)])
+def test_where_there_is_no_left_and_right_there_is_a_single_part(graph):
+    problem = repair_problem(graph, damage_chain((0.0, 0.1)), (0.0, 1.0, 10.0), 0.5)
+    assert problem.partition.num_parts == 1
+    assert problem.training[0](torch.arange(4)).batch_size == (4,)
+    assert repair_problem(grid(2, 2), damage_chain((0.0, 0.1)), (0.0, 1.0, 10.0), 0.5).partition.num_parts == 6
+
+
+def test_a_discount_that_asks_for_too_many_stages_says_so():
+    problem = tiger(0.999999)
+    for make in (RolloutPolicy, partial(POMCP, simulations=3)):
+        with pytest.raises(ValueError, match=r"max_steps must be given for a discount of 0\.999999: 4017382 stages matter"):
+            make(problem.model, problem.base_policies["listen"])

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.rows import random_control, take_rows
-from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, check_policy, controls_of
+from torchrl_pomdp.modules.rollout import Policy, check_max_steps, check_policy, controls_of
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.noise import fold, uniform
@@ -109,7 +109,7 @@ class StateMemory:
         check_callable("start", start)
         exploration = check_number("exploration", exploration, "[0, 1]")
         check_instance("workers", workers, Workers).check_device(self.model.device)
-        max_steps = check_integer("max_steps", self.model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
+        max_steps = check_max_steps(max_steps, self.model)
         if check_keys("keys", keys).ndim != 1:
             raise ValueError(f"keys must have shape [N], got {tuple(keys.shape)}")
         shared = self.model, policy, start, exploration, max_steps, (self.retain, self.seed)

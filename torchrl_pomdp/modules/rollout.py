@@ -197,7 +197,7 @@ class TruncatedRollout(MakesItsOwn):
         super().__init__()
         check_instance("model", model, BeliefModel)
         check_policy("base_policy", base_policy, model)
-        max_steps = check_integer("max_steps", model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
+        max_steps = check_max_steps(max_steps, model)
         chunk_rows = rows_at_once(_CHUNK_ROWS, model.device) if chunk_rows is None else chunk_rows
         chunk_rows = check_integer("chunk_rows", chunk_rows, 1)
         if truncation is not None:
@@ -374,6 +374,21 @@ class TruncatedRollout(MakesItsOwn):
             y = self.model.derive(take_rows(live.y, index), _read_by(terminal_cost))
             cost = terminal_costs(terminal_cost, y).to(total.dtype) * self._discounts[live.age[index]]
             total.index_add_(0, live.number[index], cost)
+
+
+def check_max_steps(max_steps: int | None, model: BeliefModel) -> int:
+    """A number of stages; None stands for :attr:`BeliefModel.horizon`.
+
+    Raises:
+        TypeError: if it is no integer.
+        ValueError: if it is not positive or too large, or None where the discount asks for too many.
+    """
+    if max_steps is None and model.horizon > MAX_STEPS:
+        raise ValueError(
+            f"max_steps must be given for a discount of {model.discount}: {model.horizon} stages matter, at most {MAX_STEPS} "
+            "are simulated"
+        )
+    return check_integer("max_steps", model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
 
 
 def _check_rest(model: BeliefModel, max_steps: int, truncation: Truncation | None) -> None:

@@ -269,7 +269,8 @@ def _blocked(tree, node, options):
     """Whether more of the tree below an ancestor cannot pay for its size."""
     if options.regularisation == 0.0:
         return False
-    ancestor, nodes = tree.parents[node], 1
+    # The node's own test is that of its first bounds.
+    ancestor, nodes = tree.parents[node], 2
     while ancestor >= 0:
         if tree.gaps[ancestor] <= options.regularisation * nodes:
             return True

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.own import MakesItsOwn
-from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, check_policy
+from torchrl_pomdp.modules.rollout import Policy, check_max_steps, check_policy
 from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine, local_engine, makeup, scalar_engine
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.stopping import check_stopped
@@ -119,7 +119,7 @@ class TreeSearch(MakesItsOwn, TensorDictModuleBase):
         self.in_keys = list(model.state_keys)
         self.base_policy = None if base_policy is None else check_policy("base_policy", base_policy, model)
         self.budget = Budget(simulations, seconds)
-        self.max_steps = check_integer("max_steps", model.horizon if max_steps is None else max_steps, 1, MAX_STEPS)
+        self.max_steps = check_max_steps(max_steps, model)
         self.seed = check_integer("seed", seed)
         self._prepare()
 

@@ -85,7 +85,8 @@ def repair_problem(
         start: what makes the start states from the model, such as
             :class:`~torchrl_pomdp.envs.repair.CalibratedStart`; of a user's own: a function that is given the model and
             returns a function from int64 keys ``[*B]`` to feature states ``[*B]``.
-        partition: the parts; None: the six of Section VI-B.
+        partition: the parts; None: the six of Section VI-B, or a single one where there are fewer than three locations, or no
+            left and right.
         name: what it is called; None: as the graph.
         device: where the model computes.
 
@@ -101,6 +102,9 @@ def repair_problem(
     """
     check_callable("start", start)
     device = check_device("device", device)
+    if partition is None and (graph.num_locations < 3 or len(graph.columns.unique()) == 1):
+        # Some of the six parts would have no states.
+        partition = SinglePart()
     if partition is None:
         partition = RepairPartition(graph, check_tensor("costs", costs, finite=False), device=device)
     model = RepairModel(

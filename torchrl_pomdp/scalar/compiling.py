@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import builtins
+import dis
 import logging
 from collections.abc import Callable
 from functools import cache
@@ -69,7 +71,15 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
 
 def _as_it_is(function: FunctionType) -> FunctionType:
-    """A copy that reads globals as they are now: numba reads them when it compiles, which is later than the digest."""
+    """A copy that reads globals as they are now: numba reads them when it compiles, which is later than the digest.
+
+    Raises:
+        NameError: if it reads one that is not defined yet.
+    """
+    known = {function.__name__, *function.__globals__, *dir(builtins)}
+    for each in dis.get_instructions(function):
+        if each.opname == "LOAD_GLOBAL" and each.argval not in known:
+            raise NameError(f"{function.__name__} reads {each.argval}, which must be defined above it: it is compiled as it is")
     copy = FunctionType(
         function.__code__, {**function.__globals__}, function.__name__, function.__defaults__, function.__closure__
     )

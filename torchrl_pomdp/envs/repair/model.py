@@ -59,7 +59,8 @@ class RepairModel(Robots):
     the levels that the robots see, robot 0 first.
 
     A robot may not leave the graph; it may repair a location known to be at level 0 only where no move is possible. States
-    with P(any damage) <= ``terminal_probability`` are terminal if level 0 is absorbing.
+    with P(any damage) <= ``terminal_probability`` are terminal if level 0 is absorbing: all is over, and what level 0 costs, if
+    anything, is paid until then only.
 
     A repair may fail: with probability :math:`1-\rho` the location takes a step of its chain as if nobody had been there. The
     robot sees the level and with it whether the repair has worked. Robots that repair one location together make one attempt.

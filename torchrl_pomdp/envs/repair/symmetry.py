@@ -2,8 +2,9 @@
 
 Reflections and rotations of a line or grid, and exchanges of robots, change neither costs nor probabilities. Every labelled
 state therefore stands for several, which is the cheapest way to more training data. The image of a label is a label by the
-image of the base policy: by the same policy if that is symmetric, as urgency is but for ties; by its mirror image, which costs
-as much over all states, if it breaks ties by number, as greedy does, or is a network.
+image of the base policy: by the same policy if that is symmetric, as urgency of one robot is but for ties; by its mirror image,
+which costs as much over all states, if it breaks ties by number, as greedy does, lets robots choose one after the other, or is
+a network.
 """
 
 from __future__ import annotations

@@ -208,7 +208,8 @@ def _relaxed(data, state, noise):
             total -= tables.interval_costs[kind, last, 0] - tables.interval_costs[kind, now, 0]
             if arrives:
                 total -= tables.discounts[last] * tables.stage_costs[kind, 0, 0]
-    return total / tables.discounts[now]
+    # All is over once damage is improbable enough, wherever it is: what it would have cost until a robot came is not paid.
+    return max(total / tables.discounts[now] - tables.forgiven, 0.0)
 
 
 repair_model = ScalarModel(

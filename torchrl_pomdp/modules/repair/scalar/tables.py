@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -83,10 +84,20 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
         upward=bool((np.tril(chain, -1) == 0).all() and (costs[:, 0] >= 0.0).all() and (np.diff(costs) >= 0.0).all()),
         least_cost=float(costs.min()),
         terminal_probability=model.terminal_probability,
+        forgiven=_forgiven(model, costs) if absorbing else 0.0,
         damage_threshold=0.0 if own is None else own.damage_threshold,
         low=0.0 if own is None else own.density_bounds[0],
         high=0.0 if own is None else own.density_bounds[1],
     )
+
+
+def _forgiven(model: RepairModel, costs: NDArray[np.float64]) -> float:
+    r"""The most that damage can cost, more than none, where its probability anywhere is at most :math:`\epsilon`.
+
+    Probabilities of damage :math:`p_i` with :math:`1-\prod(1-p_i)\le\epsilon` have a sum of at most
+    :math:`-\ln(1-\epsilon)`.
+    """
+    return -math.log1p(-model.terminal_probability) * float((costs - costs[:, :1]).max()) / (1.0 - model.discount)
 
 
 def _evolution(

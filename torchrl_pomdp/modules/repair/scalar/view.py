@@ -43,6 +43,7 @@ class Tables(NamedTuple):
         upward: whether levels never fall by themselves, higher ones cost no less, and none costs less than nothing.
         least_cost: of a level, anywhere.
         terminal_probability: :math:`\epsilon`.
+        forgiven: the most, discounted, that damage of no more than this probability can cost; zero where nothing is terminal.
         damage_threshold: of the partition.
         low: density bound of the partition.
         high: the other one.
@@ -70,6 +71,7 @@ class Tables(NamedTuple):
     upward: bool
     least_cost: float
     terminal_probability: float
+    forgiven: float
     damage_threshold: float
     low: float
     high: float
@@ -151,6 +153,14 @@ def legal(view, robot, control):
 
 
 @inner
+def split(number, base, digits):
+    """Put the base-``base`` digits of a joint control or observation into ``digits`` ``[R]``, robot 0 first."""
+    for robot in range(len(digits) - 1, -1, -1):
+        digits[robot] = number % base
+        number //= base
+
+
+@inner
 def jointly_legal(view, u, controls):
     """Whether the robots may take joint control ``u``, which is put into ``controls`` ``[R]``."""
     split(u, view.tables.destinations.shape[1], controls)
@@ -158,14 +168,6 @@ def jointly_legal(view, u, controls):
     for robot in range(len(controls)):
         fits = fits and legal(view, robot, controls[robot])
     return fits
-
-
-@inner
-def split(number, base, digits):
-    """Put the base-``base`` digits of a joint control or observation into ``digits`` ``[R]``, robot 0 first."""
-    for robot in range(len(digits) - 1, -1, -1):
-        digits[robot] = number % base
-        number //= base
 
 
 @shared
