@@ -51,10 +51,10 @@ class World(ABC):
         >>> world = problem.model.world()
         >>> hidden = world.sample(problem.start(keys), keys)
         >>> hidden["state"].tolist()
-        [1, 1, 0, 1]
+        [1, 0, 0, 1]
         >>> cost, hidden, z = world.step(hidden, torch.zeros_like(keys), fold(keys, 1))
         >>> cost.tolist(), z.tolist()
-        ([1.0, 1.0, 1.0, 1.0], [1, 1, 1, 0])
+        ([1.0, 1.0, 1.0, 1.0], [1, 0, 1, 0])
     """
 
     draw_dim: int

@@ -25,10 +25,10 @@ class RockWorld(World):
         >>> world, keys = problem.model.world(), torch.arange(1)
         >>> hidden = world.sample(problem.start(keys), keys)
         >>> hidden["good"].int().tolist()
-        [[0, 0, 1, 1, 1, 1, 1, 0]]
+        [[0, 0, 0, 0, 1, 0, 0, 0]]
         >>> _, _, z = world.step(hidden, torch.tensor([FIRST_CHECK + 6]), keys)
         >>> problem.model.observation_names[z]
-        'good'
+        'bad'
     """
 
     model: RockSample

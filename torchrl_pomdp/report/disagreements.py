@@ -40,7 +40,7 @@ def disagreements(
         >>> bases = problem.base_policies
         >>> found = disagreements(problem, bases["listen"], bases["myopic"], problem.start(keys), keys, max_steps=5)
         >>> found.parts
-        {'all': (100, 18)}
+        {'all': (100, 19)}
     """
     model = problem.model
     visited = play(model, trained, y, keys, max_steps=max_steps)

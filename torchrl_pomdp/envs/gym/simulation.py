@@ -147,7 +147,7 @@ class WorldSimulation(Simulation):
         >>> simulation, keys = WorldSimulation(problem.model, problem.start), torch.arange(3)
         >>> start = simulation.start(keys)
         >>> simulation.observed(start), simulation.observed(simulation.step(start, torch.zeros_like(keys), keys)[1])
-        (array([2, 2, 2]), array([1, 1, 1]))
+        (array([2, 2, 2]), array([1, 0, 1]))
     """
 
     def __init__(self, model: BeliefModel, generator: StateGenerator) -> None:

@@ -33,7 +33,7 @@ class NetworkScene(Scene):
         >>> scene.layout()["edges"]
         [[0, 1], [1, 2]]
         >>> scene.frames(play(problem.model, problem.base_policies["greedy"], problem.start(key), key, max_steps=1))
-        [{'does': 'robot 1 repairs 0', 'damage': [1.0, 2.0, 2.0], 'truth': [1, 1, 0], 'robots': [0], 'to': [-1]}]
+        [{'does': 'robot 1 repairs 0', 'damage': [1.0, 2.0, 2.0], 'truth': [1, 3, 1], 'robots': [0], 'to': [-1]}]
     """
 
     model: RepairModel

@@ -36,10 +36,10 @@ class RepairWorld(World):
         >>> world, repair, key = problem.model.world(), torch.tensor(REPAIR), torch.tensor(1)
         >>> hidden = world.sample(problem.start(key), key)
         >>> hidden["level"].tolist(), hidden["location"].tolist()
-        ([1, 1, 4], [0])
+        ([1, 0, 1], [0])
         >>> cost, hidden, z = world.step(hidden, repair, key)
         >>> round(float(cost), 2), hidden["level"].tolist(), int(z)
-        (100.2, [0, 1, 4], 0)
+        (0.2, [0, 0, 1], 0)
     """
 
     model: RepairModel
