@@ -154,6 +154,9 @@ def test_links_lead_somewhere(document):
             # In the documentation results and tutorials lie beside its own pages.
             beside = ROOT / path.relative_to(ROOT / "docs") if path.is_relative_to(ROOT / "docs") else path
             assert path.exists() or beside.exists(), target
+            # They are copied there, and what lies elsewhere is not beside them any more.
+            results = ROOT / "results"
+            assert path.is_relative_to(results) or not document.is_relative_to(results), target
 
 
 def test_the_readme_is_short_and_links_its_pages():
