@@ -131,9 +131,10 @@ class _Graph:
                 if path:
                     lowest[path[-1][0]] = min(lowest[path[-1][0]], lowest[key])
                 if lowest[key] == number[key]:
-                    first = waiting.index(key)
-                    self._close(waiting[first:])
-                    del waiting[first:]
+                    members = [waiting.pop()]
+                    while members[-1] != key:
+                        members.append(waiting.pop())
+                    self._close(members)
         return self._digests[root]
 
     def _key(self, value: Any) -> _Key:

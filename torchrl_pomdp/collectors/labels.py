@@ -21,6 +21,7 @@ from torchrl_pomdp.collectors.states import StateSampler
 from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
+from torchrl_pomdp.modules.lookahead import simulated_steps
 from torchrl_pomdp.modules.rollout import Policy, controls_of
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.progress import progress_bar
@@ -244,21 +245,12 @@ def label_states(shared: tuple[Any, ...], numbers: Tensor) -> tuple[TensorDictBa
         numbers: numbers of the states, ``[N]``.
     """
     model, labeller, states, summary = shared
-    before, begin = _steps(labeller), time.perf_counter()
+    before, begin = simulated_steps(labeller) or 0, time.perf_counter()
     with torch.no_grad():
         block = labeller(model.derive(model.drawn(states, numbers, "states")))
-    seconds = time.perf_counter() - begin
-    report = {
-        "simulated_steps": _steps(labeller) - before,
-        "seconds": seconds,
-        "summary": summary and summary(block),
-    }
+    seconds, steps = time.perf_counter() - begin, (simulated_steps(labeller) or 0) - before
+    report = {"simulated_steps": steps, "seconds": seconds, "summary": summary and summary(block)}
     return block, report
-
-
-def _steps(labeller: TensorDictModuleBase) -> int:
-    """Belief steps that a labelling module has simulated so far; none where it does not count."""
-    return int(getattr(labeller, "simulated_steps", 0))
 
 
 def _environment(create_env_fn: Any) -> BeliefEnv:

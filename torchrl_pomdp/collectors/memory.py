@@ -201,18 +201,10 @@ def _walk(
         yield y, fold(fold(keys, _RETAIN), step)
         u = controls_of("policy", policy, y.copy())
         model.check_controls(y, u)
-        random = random_control(y.get("action_mask"), _uniforms(model, keys, _CONTROL, step))
-        u = torch.where(_uniforms(model, keys, _EXPLORE, step) < exploration, random, u)
+        random = random_control(y.get("action_mask"), model.control_noise(fold(keys, _CONTROL), step))
+        u = torch.where(model.control_noise(fold(keys, _EXPLORE), step) < exploration, random, u)
         noise, scenarios = scenarios.draw(torch.full_like(keys, step), model.observed(y, u), 1)
         _, y = model.advance(y, u, noise)
-
-
-def _uniforms(model: BeliefModel, keys: Tensor, purpose: int, step: int) -> Tensor:
-    """A number for every control of a step, ``[N, *S]``: many agents explore each by itself."""
-    if model.enumerable:
-        return uniform(fold(keys, purpose), step)
-    agents = torch.arange(model.num_agents, device=keys.device)
-    return uniform(fold(fold(keys, purpose), step).unsqueeze(-1), agents)
 
 
 def _retained(model: BeliefModel, y: TensorDictBase, visit: Tensor, retain: float, seed: int) -> TensorDictBase:

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.digits import digits, joined
+from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import place
 
 __all__ = ["MAX_ENUMERATED", "JointControls", "check_index"]
@@ -81,6 +82,12 @@ class JointControls(nn.Module):
     def join_controls(self, controls: Tensor) -> Tensor:
         """Joint controls ``[*B, *S]`` of agents' controls ``[*B, R]``."""
         return joined(controls, self.num_agent_controls) if self.enumerable else controls
+
+    def control_noise(self, keys: Tensor, name: int) -> Tensor:
+        """Uniforms ``[*B, *S]`` for random controls from keys ``[*B]``: many agents draw each for itself."""
+        if self.enumerable:
+            return uniform(keys, name)
+        return uniform(fold(keys, name).unsqueeze(-1), torch.arange(self.num_agents, device=keys.device))
 
     def check_enumerable(self, component: str, instead: str) -> None:
         """Raise, for a component that goes through all joint controls, where these are too many.

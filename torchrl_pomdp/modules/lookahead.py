@@ -2,8 +2,12 @@ r"""One-step lookahead with rollout at its leaves: the policy :math:`\tilde\mu` 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_number
@@ -68,6 +72,16 @@ class RolloutPolicy(SimulatedQFactors):
         if keys is not None:
             keys = _checked_keys(keys, y).reshape(-1)
         return self._factors(y, None, None, keys, seconds).view(*y.batch_size, self.model.num_controls)
+
+
+def simulated_steps(policy: Callable[..., Any]) -> int | None:
+    """Belief steps that a policy, or the rollouts in it, have simulated; None where it simulates nothing."""
+    if not isinstance(policy, TensorDictModuleBase):
+        return None
+    if hasattr(policy, "simulated_steps"):
+        return int(policy.simulated_steps)
+    parts = {part for part in policy.modules() if isinstance(part, RolloutPolicy)}
+    return sum(part.simulated_steps for part in parts) if parts else None
 
 
 def _checked_keys(keys: Tensor, y: TensorDictBase) -> Tensor:

@@ -169,10 +169,6 @@ def _number(model: BeliefModel, part: Tensor) -> Tensor:
 
 def _random_controls(model: BeliefModel) -> Callable[[TensorDictBase, Tensor], Tensor]:
     def choose(y: TensorDictBase, keys: Tensor) -> Tensor:
-        numbers = uniform(keys, 0)
-        if not model.enumerable:
-            # Each agent chooses for itself.
-            numbers = uniform(keys.unsqueeze(-1), torch.arange(model.num_agents, device=keys.device))
-        return random_control(y.get("action_mask"), numbers)
+        return random_control(y.get("action_mask"), model.control_noise(keys, 0))
 
     return choose

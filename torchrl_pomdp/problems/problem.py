@@ -21,7 +21,6 @@ from torchrl_pomdp.modules.base_policies import Myopic, as_policy
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.rollout import Policy
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, ConstantCost, ZeroCost
-from torchrl_pomdp.noise import fold, uniform
 
 __all__ = ["Problem", "Symmetry"]
 
@@ -220,7 +219,6 @@ def _largest_cost(model: BeliefModel, start: StateGenerator) -> float:
         if model.enumerable:
             u, counts = torch.full_like(keys, number), mask[:, number] & live
         else:
-            agents = torch.arange(model.num_agents, device=model.device)
-            u, counts = random_control(mask, uniform(fold(keys, number).unsqueeze(-1), agents)), live
+            u, counts = random_control(mask, model.control_noise(keys, number)), live
         largest = max(largest, float(model.expected_cost(y, u).abs().masked_fill(~counts, 0.0).max()))
     return largest

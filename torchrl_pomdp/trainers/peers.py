@@ -26,7 +26,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 
 from torchrl_pomdp.checks import (
     check_callable,
@@ -44,6 +43,7 @@ from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import Policy, RolloutPolicy, ValueNetwork
+from torchrl_pomdp.modules.lookahead import simulated_steps
 from torchrl_pomdp.modules.partitioned import local_policies
 from torchrl_pomdp.modules.threads import kept_threads
 from torchrl_pomdp.noise import fold, seed_keys
@@ -245,9 +245,9 @@ class _Execution:
             yield block
 
     def _evaluate(self, name: str, model: Any, policy: Policy, first: int, count: int) -> dict[str, Any]:
-        simulates = _simulated_steps(policy) is not None
+        simulates = simulated_steps(policy) is not None
         counted = _Counted(policy) if simulates else policy
-        before = _simulated_steps(policy) or 0
+        before = simulated_steps(policy) or 0
         costs = discounted_costs(
             model,
             counted,
@@ -259,7 +259,7 @@ class _Execution:
             progress=self.progress,
             name=name,
         )
-        steps = (_simulated_steps(policy) or 0) - before
+        steps = (simulated_steps(policy) or 0) - before
         return {"costs": costs.cpu(), "decisions": counted.decisions if isinstance(counted, _Counted) else 0, "steps": steps}
 
     def _time(self, name: str, policy: Policy, owner: str) -> float:
@@ -282,13 +282,3 @@ def _seconds(policy: Policy, y: TensorDictBase) -> float:
     begin = perf_counter()
     policy(y.clone())
     return perf_counter() - begin
-
-
-def _simulated_steps(policy: Policy) -> int | None:
-    """Belief steps that a policy, or the rollouts in it, have simulated; None where it simulates nothing."""
-    if not isinstance(policy, TensorDictModuleBase):
-        return None
-    if hasattr(policy, "simulated_steps"):
-        return int(policy.simulated_steps)
-    parts = {part for part in policy.modules() if isinstance(part, RolloutPolicy)}
-    return sum(part.simulated_steps for part in parts) if parts else None
