@@ -233,6 +233,8 @@ def test_what_stops_a_part_stops_all(line3, monkeypatch):
 
 def test_parts_that_are_stopped_stop_in_the_middle_of_their_training(line3, monkeypatch):
     """Nobody waits for a million steps."""
+    # What starts once in a process, such as the monitor of progress bars, is there before.
+    list(asynchronously(line3, config=replace(CONFIG, iterations=1)))
     run = asynchronously(line3, config=replace(CONFIG, least_steps=1_000_000))
     before = set(threading.enumerate())
     stepping = threading.Event()

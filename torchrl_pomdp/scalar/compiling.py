@@ -104,6 +104,7 @@ def entry(function: Any, *args: Any) -> Callable[..., Any]:
         compiled: Callable[..., Any] = function.compile(tuple(map(typeof, args)))
     finally:
         timer.cancel()
+        timer.join()
     return compiled
 
 
