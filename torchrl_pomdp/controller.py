@@ -15,7 +15,7 @@ from torchrl_pomdp.checks import check_flag, check_instance, check_integer, chec
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.partition import SinglePart
 from torchrl_pomdp.identity import digest
-from torchrl_pomdp.modules.rollout import Policy, check_policy, controls_of
+from torchrl_pomdp.modules.policies import Policy, check_policy, controls_of
 
 __all__ = ["Controller", "Decision"]
 

@@ -13,7 +13,8 @@ from tqdm import tqdm
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_text
 from torchrl_pomdp.config import MAX_STATES
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
-from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout, check_policy
+from torchrl_pomdp.modules.policies import Policy, TerminalCost, check_policy
+from torchrl_pomdp.modules.rollout import TruncatedRollout
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, scalar_engine
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.progress import progress_bar

@@ -9,7 +9,8 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.world import World
-from torchrl_pomdp.modules.rollout import Policy, check_max_steps, check_policy, controls_of
+from torchrl_pomdp.modules.policies import Policy, check_policy, controls_of
+from torchrl_pomdp.modules.rollout import check_max_steps
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.tensor_checks import check_keys
 

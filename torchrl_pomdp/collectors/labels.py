@@ -22,7 +22,7 @@ from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules.lookahead import simulated_steps
-from torchrl_pomdp.modules.rollout import Policy, controls_of
+from torchrl_pomdp.modules.policies import Policy, controls_of
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.workers import LOCAL, Workers

@@ -13,7 +13,8 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_callable, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.rows import random_control, take_rows
-from torchrl_pomdp.modules.rollout import Policy, check_max_steps, check_policy, controls_of
+from torchrl_pomdp.modules.policies import Policy, check_policy, controls_of
+from torchrl_pomdp.modules.rollout import check_max_steps
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.noise import fold, uniform

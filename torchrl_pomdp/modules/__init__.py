@@ -9,7 +9,8 @@ from torchrl_pomdp.modules.multistep import MultistepLookahead
 from torchrl_pomdp.modules.networks import PolicyNetwork, ValueNetwork
 from torchrl_pomdp.modules.parallel import ParallelRollout
 from torchrl_pomdp.modules.partitioned import PartitionedPolicy, PartitionedValue
-from torchrl_pomdp.modules.rollout import Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.policies import Policy, TerminalCost
+from torchrl_pomdp.modules.rollout import TruncatedRollout
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, ConstantCost, PolicyCost, ZeroCost
 from torchrl_pomdp.modules.truncation import AfterSteps, OnEntering, OnLeaving, Truncation
 

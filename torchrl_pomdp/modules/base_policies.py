@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl_pomdp.checks import check_callable, check_instance, check_text
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.tabular import TabularModel
-from torchrl_pomdp.modules.rollout import Policy, controls_of
+from torchrl_pomdp.modules.policies import Policy, controls_of
 from torchrl_pomdp.modules.scalar import Limited, SearchEngine, offer_engines
 from torchrl_pomdp.tensor_checks import check_entries, device_of
 

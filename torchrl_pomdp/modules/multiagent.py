@@ -16,8 +16,8 @@ from torchrl_pomdp.checks import check_callable, check_choice, check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import flat_rows
 from torchrl_pomdp.modules.own import MakesItsOwn
+from torchrl_pomdp.modules.policies import Policy, TerminalCost, controls_of
 from torchrl_pomdp.modules.qfactors import SimulatedQFactors, cheapest
-from torchrl_pomdp.modules.rollout import Policy, TerminalCost, controls_of
 from torchrl_pomdp.modules.truncation import Truncation
 
 __all__ = ["SCHEMES", "MultiagentRollout"]

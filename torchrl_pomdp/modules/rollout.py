@@ -2,7 +2,6 @@ r"""The rollout engine: Monte-Carlo estimates of :math:`(T_\mu^m\hat J)(y)` (pap
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from threading import Lock
 from typing import Any, NamedTuple, cast
 
@@ -10,26 +9,28 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, shown
+from torchrl_pomdp.checks import check_flag, check_instance, check_integer
 from torchrl_pomdp.envs.belief_model import INSIGNIFICANT, BeliefModel
 from torchrl_pomdp.envs.rows import put_rows, take_rows
 from torchrl_pomdp.modules.compiling import compiled
 from torchrl_pomdp.modules.own import MakesItsOwn
+from torchrl_pomdp.modules.policies import (
+    Policy,
+    TerminalCost,
+    check_finite,
+    check_policy,
+    controls_of,
+    read_by,
+    terminal_costs,
+)
 from torchrl_pomdp.modules.scalar import Limited, ScalarEngine, makeup, scalar_engine
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import rows_at_once
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.stopping import check_stopped
-from torchrl_pomdp.tensor_checks import check_keys, place
+from torchrl_pomdp.tensor_checks import check_keys
 
-__all__ = ["MAX_STEPS", "MAX_TRAJECTORIES", "Policy", "TerminalCost", "TruncatedRollout", "terminal_costs"]
-
-Policy = Callable[[TensorDictBase], TensorDictBase]
-"""A policy writes ``"action"``, int64 ``[*B]``, into a TensorDict of feature states; any TensorDictModule with that key."""
-
-TerminalCost = Callable[[TensorDictBase], Tensor | TensorDictBase]
-r"""Terminal cost approximation :math:`\hat J`: feature states ``[*B]`` to costs ``[*B]``, or a TensorDictModule that writes
-them as ``"state_value"`` ``[*B]`` (costs, lower is better). ``in_keys``, where it has them, name the features that it reads."""
+__all__ = ["MAX_STEPS", "MAX_TRAJECTORIES", "TruncatedRollout", "check_max_steps"]
 
 # Default of `chunk_rows` on a CPU. No power of two: planes that lie so far apart compete for cache lines.
 _CHUNK_ROWS = 16_000
@@ -39,64 +40,6 @@ MAX_STEPS, MAX_TRAJECTORIES = 1_000_000, 1 << 24
 _CHECKED = 256
 # Finished rows give way to waiting ones when they are this fraction of the live rows; doing it more often costs more copies.
 _RENEW_FRACTION = 0.15
-
-
-def terminal_costs(terminal_cost: TerminalCost, y: TensorDictBase) -> Tensor:
-    r""":math:`\hat J(y)` ``[*B]`` of either form of terminal cost.
-
-    Args:
-        terminal_cost: :math:`\hat J`.
-        y: feature states ``[*B]`` with the entries that it reads; a TensorDictModule may write into it.
-
-    Raises:
-        TypeError: if it gives no costs.
-        ValueError: if they have not the shape of the batch, or are not finite.
-    """
-    result = terminal_cost(y)
-    cost = result.get("state_value", None) if isinstance(result, TensorDictBase) else result
-    if cost is None and isinstance(result, TensorDictBase):
-        raise ValueError("terminal_cost must return costs or write 'state_value', got a TensorDict without it")
-    if not isinstance(cost, Tensor) or not cost.is_floating_point():
-        raise TypeError(f"terminal_cost must return floating costs or write 'state_value', got {shown(cost)}")
-    if cost.shape != y.batch_size:
-        raise ValueError(f"terminal_cost must give costs of shape {tuple(y.batch_size)}, got {tuple(cost.shape)}")
-    check_finite("terminal_cost must give finite costs", cost)
-    return cost
-
-
-def check_policy(name: str, policy: Any, model: BeliefModel) -> Any:
-    """A policy or terminal cost, called ``name`` in messages, that can be called and is none for another model.
-
-    Raises:
-        TypeError: if it cannot be called.
-        ValueError: if it has local modules for other parts than the model's.
-    """
-    check_callable(name, policy)
-    num_parts = getattr(policy, "num_parts", None)
-    parts = 1 if model.partition is None else model.partition.num_parts
-    if num_parts is not None and num_parts != parts:
-        raise ValueError(f"{name} must have a local module for each of the model's {parts} parts, got {num_parts}")
-    return policy
-
-
-def controls_of(name: str, policy: Policy, y: TensorDictBase) -> Tensor:
-    """The controls ``[*B]`` that a policy, called ``name`` in messages, writes at ``y`` ``[*B]``; it may write into ``y``.
-
-    Raises:
-        TypeError: if it returns no TensorDict with controls.
-    """
-    result = policy(y)
-    u = result.get("action", None) if isinstance(result, TensorDictBase) else None
-    if not isinstance(u, Tensor):
-        raise TypeError(f"{name} must write 'action' into a TensorDict and return it, got {shown(result)}")
-    return u
-
-
-def check_finite(rule: str, costs: Tensor) -> None:
-    """Raise the rule, and where it is broken, unless all costs are finite."""
-    if not bool(torch.isfinite(costs).all()):
-        where = tuple((~torch.isfinite(costs)).nonzero()[0].tolist())
-        raise ValueError(f"{rule}, got {costs[where].item()}{place(where)}")
 
 
 class _Live(NamedTuple):
@@ -285,7 +228,7 @@ class TruncatedRollout(MakesItsOwn):
             costs, made, cut = engine.simulate(y[first], scenarios.rows(rows), count)
             total[first], steps = costs.to(total.dtype), steps + made
             if cut is not None:
-                rest = self.model.derive(cut.y, _read_by(cast(TerminalCost, self.terminal_cost)))
+                rest = self.model.derive(cut.y, read_by(cast(TerminalCost, self.terminal_cost)))
                 weight = self._discounts[cut.ages]
                 total[rows[cut.rows]] += terminal_costs(cast(TerminalCost, self.terminal_cost), rest).to(total.dtype) * weight
         return steps
@@ -313,7 +256,7 @@ class TruncatedRollout(MakesItsOwn):
 
     def _read_keys(self) -> tuple[str, ...] | None:
         """Features read at every step, no others are computed; None, all of them. Local policies may have been replaced."""
-        keys = _read_by(self.base_policy)
+        keys = read_by(self.base_policy)
         return keys and (*keys, *(() if self.truncation is None else self.truncation.in_keys))
 
     def _check_policy(self, y: TensorDictBase) -> None:
@@ -371,7 +314,7 @@ class TruncatedRollout(MakesItsOwn):
     def _add_terminal_costs(self, terminal_cost: TerminalCost, live: _Live, index: Tensor, total: Tensor) -> None:
         """The terminal cost of the rows ``index`` of ``live``, with features that are made for it here alone."""
         if index.numel():
-            y = self.model.derive(take_rows(live.y, index), _read_by(terminal_cost))
+            y = self.model.derive(take_rows(live.y, index), read_by(terminal_cost))
             cost = terminal_costs(terminal_cost, y).to(total.dtype) * self._discounts[live.age[index]]
             total.index_add_(0, live.number[index], cost)
 
@@ -409,8 +352,3 @@ def _check_range(u: Tensor, model: BeliefModel) -> None:
     if u.dtype != torch.int64 or not 0 <= int(low) <= int(high) < model.control_range:
         allowed = f"0..{model.control_range - 1}"
         raise ValueError(f"base_policy must write int64 actions {allowed}, got {u.dtype} from {low} to {high}")
-
-
-def _read_by(reader: Policy | TerminalCost) -> tuple[str, ...] | None:
-    """Features that a module says it reads; None, all of them, for a plain callable."""
-    return tuple(getattr(reader, "in_keys", ())) or None

@@ -13,7 +13,8 @@ from torchrl_pomdp.checks import check_callable, check_instance, check_integer, 
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.rows import flat_rows, take_rows
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import MAX_TRAJECTORIES, Policy, TerminalCost, TruncatedRollout
+from torchrl_pomdp.modules.policies import Policy, TerminalCost
+from torchrl_pomdp.modules.rollout import MAX_TRAJECTORIES, TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.modules import ClosedFormCost
-from torchrl_pomdp.modules.rollout import check_finite
+from torchrl_pomdp.modules.policies import check_finite
 from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, with_weights, without_modes
 
 __all__ = ["ValueLoss"]

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.modules.rollout import MAX_STEPS, MAX_TRAJECTORIES, Policy
+from torchrl_pomdp.modules.policies import Policy
+from torchrl_pomdp.modules.rollout import MAX_STEPS, MAX_TRAJECTORIES
 from torchrl_pomdp.modules.scalar import Roots
 from torchrl_pomdp.planners.tree_search import TreeSearch, grown
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchrl_pomdp.checks import check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
-from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.modules.policies import Policy
 from torchrl_pomdp.modules.scalar import Roots
 from torchrl_pomdp.planners.tree_search import TreeSearch, grown
 

@@ -19,7 +19,8 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.own import MakesItsOwn
-from torchrl_pomdp.modules.rollout import Policy, check_max_steps, check_policy
+from torchrl_pomdp.modules.policies import Policy, check_policy
+from torchrl_pomdp.modules.rollout import check_max_steps
 from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine, local_engine, makeup, scalar_engine
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.stopping import check_stopped

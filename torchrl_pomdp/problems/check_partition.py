@@ -14,7 +14,8 @@ from torchrl_pomdp.config import MAX_STATES
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.rows import random_control, take_rows
-from torchrl_pomdp.modules.rollout import MAX_STEPS, Policy, check_policy, controls_of
+from torchrl_pomdp.modules.policies import Policy, check_policy, controls_of
+from torchrl_pomdp.modules.rollout import MAX_STEPS
 from torchrl_pomdp.noise import fold, seed_keys, uniform
 
 __all__ = ["PartitionReport", "check_partition"]

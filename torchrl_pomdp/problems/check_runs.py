@@ -11,7 +11,8 @@ from torch import Tensor
 from torchrl_pomdp.envs.belief_env import BeliefEnv
 from torchrl_pomdp.envs.belief_model import BeliefModel, StateGenerator
 from torchrl_pomdp.envs.rows import random_control
-from torchrl_pomdp.modules.rollout import Policy, TruncatedRollout
+from torchrl_pomdp.modules.policies import Policy
+from torchrl_pomdp.modules.rollout import TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.terminal_costs import ZeroCost
 from torchrl_pomdp.noise import fold, seed_keys, uniform

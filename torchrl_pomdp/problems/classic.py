@@ -10,7 +10,7 @@ from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.generators import FixedBelief
 from torchrl_pomdp.envs.tabular import TabularModel
 from torchrl_pomdp.modules.base_policies import Myopic
-from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.modules.policies import Policy
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.tensor_checks import check_entries
 

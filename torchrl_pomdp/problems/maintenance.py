@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.encoders import Encoder
-from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.modules.policies import Policy
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
 from torchrl_pomdp.noise import fold, uniform
 from torchrl_pomdp.problems.maintenance_model import INSPECT, REPLACE, Component, MaintenanceModel

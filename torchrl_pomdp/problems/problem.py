@@ -19,7 +19,7 @@ from torchrl_pomdp.envs.rows import random_control
 from torchrl_pomdp.modules.agents import AgentEncoder, FlatAgentEncoder
 from torchrl_pomdp.modules.base_policies import Myopic, as_policy
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
-from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.modules.policies import Policy
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, ConstantCost, ZeroCost
 
 __all__ = ["Problem", "Symmetry"]

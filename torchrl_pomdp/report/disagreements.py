@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_pomdp.modules.rollout import Policy, controls_of
+from torchrl_pomdp.modules.policies import Policy, controls_of
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.trajectories import play
 

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 
 from torchrl_pomdp.config import EVALUATION_SEED
 from torchrl_pomdp.envs.scene import MOST_CONTROLS, control_bars
-from torchrl_pomdp.modules.rollout import Policy
+from torchrl_pomdp.modules.policies import Policy
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.trajectories import play

@@ -15,7 +15,7 @@ from torchrl_pomdp.checks import check_callable, check_instance, check_integer
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.envs.rows import flat_rows
-from torchrl_pomdp.modules.rollout import Policy, controls_of
+from torchrl_pomdp.modules.policies import Policy, controls_of
 from torchrl_pomdp.modules.scalar import Limited, ScalarEngine
 from torchrl_pomdp.tensor_checks import check_entries
 

@@ -10,7 +10,7 @@ from torchrl_pomdp.checks import check_instance, shown
 from torchrl_pomdp.envs.repair.chains import location_costs, prices
 from torchrl_pomdp.envs.repair.model import RepairModel
 from torchrl_pomdp.envs.sums import sum_first
-from torchrl_pomdp.modules.rollout import check_finite
+from torchrl_pomdp.modules.policies import check_finite
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost
 
 __all__ = ["NeverRepairCost", "SteadyStateCost"]
