@@ -294,3 +294,21 @@ def test_the_help_has_no_line_that_is_broken_in_the_middle(module):
             if isinstance(entry, ast.Expr) and entry is not own.body[0]:
                 _, *lines = ast.literal_eval(entry.value).splitlines()
                 assert all(line.strip().startswith("- ") for line in lines), lines
+
+
+def test_a_picture_is_of_one_trajectory_of_the_model(linear20):
+    greedy = GreedyRepair(linear20.model)
+    several = BeliefEnv(linear20.model, linear20.start, batch_size=(4,)).rollout(5, greedy)
+    with pytest.raises(ValueError, match=r"trajectory must be one trajectory of at least one stage, got batch \(4, 5\)"):
+        trajectory_figure(linear20.model, several)
+    with pytest.raises(ValueError, match="action of trajectory must be in"):
+        trajectory_figure(linear20.model, several[0].set("action", several[0]["action"] + 7))
+
+
+def test_a_measurement_of_more_states_is_not_overwritten(tmp_path):
+    path = tmp_path / "changes" / "model-changes.md"
+    path.parent.mkdir()
+    path.write_text("damage three times as fast, 2100 start states, 10 trajectories of each control, ratios\n")
+    command = cli.Changes(states=100, trajectories=10, out=tmp_path)
+    with pytest.raises(ValueError, match="holds another measurement, not of 100 start states"):
+        commands.changes(command)

@@ -46,3 +46,8 @@ def test_equal_numbers_are_equal_configurations():
     """Whether sizes come as a list, as from JSON, or as a tuple."""
     assert PolicyIterationConfig(hidden=[8, 4], seed=2**63 - 1) == PolicyIterationConfig(hidden=(8, 4), seed=2**63 - 1)
     assert PolicyIterationConfig(learning_rate=1).learning_rate == 1.0
+
+
+def test_one_validation_state_tells_nothing():
+    with pytest.raises(ValueError, match="validation_states must be at least 2, got 1"):
+        PolicyIterationConfig(validation_states=1)

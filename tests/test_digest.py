@@ -20,6 +20,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_pomdp.collectors.states import PartSampler
 from torchrl_pomdp.envs.repair import CalibratedStart, grid, line
 from torchrl_pomdp.identity import digest, identity
 from torchrl_pomdp.modules import MultiagentRollout, PolicyNetwork, RolloutPolicy
@@ -236,7 +237,7 @@ def test_equal_content_has_equal_digests_and_other_content_others(name):
 
 
 def test_what_says_nothing_of_the_content_does_not_matter():
-    assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
+    assert digest(types.SimpleNamespace(a=1, b=2)) == digest(types.SimpleNamespace(b=2, a=1))
     assert digest(torch.arange(6).view(2, 3).T.contiguous()) == digest(torch.arange(6).view(2, 3).T)
     assert digest(torch.ones(2, requires_grad=True)) == digest(torch.ones(2))
     problem = make_problem("line3")
@@ -245,6 +246,16 @@ def test_what_says_nothing_of_the_content_does_not_matter():
         before = digest(policy)
         policy(problem.start(torch.arange(2)))
         assert digest(policy) == before == digest(copy.deepcopy(policy)) == digest(policy.eval())
+
+
+def test_the_order_of_a_mapping_counts():
+    """Layers compute in their order, and samplers take parts in turn."""
+    assert digest({"a": 1, "b": 2}) != digest({"b": 2, "a": 1})
+    first, second = torch.nn.Linear(2, 2), torch.nn.Linear(2, 2)
+    one, other = ({"a": first, "b": second}, {"b": second, "a": first})
+    assert digest(torch.nn.ModuleDict(one)) != digest(torch.nn.ModuleDict(other))
+    sample = make_problem("line3").start
+    assert digest(PartSampler({0: sample, 4: sample}, seed=0)) != digest(PartSampler({4: sample, 0: sample}, seed=0))
 
 
 class Cached:
@@ -270,7 +281,8 @@ def test_what_is_found_out_later_does_not_count():
 
 def test_the_order_in_which_entries_were_made_does_not_matter():
     one, two = (calls_back(n).__globals__ for n in (1, 2))
-    assert digest({"a": one["one"], "b": one["two"]}) == digest({"b": one["two"], "a": one["one"]})
+    entries, turned = types.SimpleNamespace(a=one["one"], b=one["two"]), types.SimpleNamespace(b=one["two"], a=one["one"])
+    assert digest(entries) == digest(turned)
     assert digest({"a": one["one"], "b": one["two"]}) != digest({"a": two["one"], "b": two["two"]})
 
 

@@ -225,11 +225,13 @@ def main(args: list[str] | None = None) -> int:
     command: Train | Evaluate | Compare | Changes | Reproduce | Report | Problems = tyro.cli(
         choices, prog="torchrl-pomdp", description=about, args=args
     )
-    from torchrl import logger
+    try:
+        from torchrl import logger
 
-    from torchrl_pomdp import commands
-    from torchrl_pomdp.workers import WorkerError
-
+        from torchrl_pomdp import commands
+        from torchrl_pomdp.workers import WorkerError
+    except KeyboardInterrupt:
+        return 130
     logger.setLevel("WARNING")
     try:
         if isinstance(command, Train):

@@ -130,7 +130,7 @@ def _trajectory_figure(problem: Problem, model: RepairModel, policy: Policy) -> 
 
 def evaluate(command: Evaluate) -> None:
     """Compare a policy with the base policies; print the table."""
-    check_integer("states", command.states, 1, MAX_STATES)
+    check_integer("states", command.states, 2, MAX_STATES)
     check_integer("trajectories", command.trajectories, 1, 10**6)
     check_seed("seed", command.seed)
     problem, policy, name = _named_policy(command, check_device("device", command.device))
@@ -212,7 +212,7 @@ def changes(command: Changes) -> None:
     """Measure all changes of models; print the table and write it."""
     path = check_folder("out", command.out) / "changes" / "model-changes.md"
     numbers = f"{command.states} start states, {command.trajectories} trajectories of each control"
-    if path.is_file() and numbers not in path.read_text().partition("\n")[0]:
+    if path.is_file() and f", {numbers}, " not in path.read_text().partition("\n")[0]:
         raise ValueError(f"out must be another folder: {path} holds another measurement, not of {numbers}")
     found = measure_changes(
         command.states,

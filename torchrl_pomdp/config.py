@@ -14,12 +14,14 @@ EVALUATION_SEED = 20200
 
 # Most start states of an evaluation: their costs are kept together.
 MAX_STATES = 10**8
-# Counts, from 1, with their largest values: above any use, below what no machine could hold or finish.
+# Counts, from 1 or what _LEAST says, with their largest values: above any use, below what no machine could hold or finish.
 _COUNTS = {
     "iterations": 1000, "samples_per_part": 10**9, "trajectories": 10**6, "max_steps": 10**6, "label_steps": 10**6,
     "memory_capacity": 10**9, "value_samples": 10**9, "batch_size": 10**7, "epochs": 10**6, "least_steps": 10**9,
     "validation_states": MAX_STATES,
 }  # fmt: skip
+# The standard error of a single cost is not known.
+_LEAST = {"validation_states": 2}
 _INTERVALS = {"visited_share": "[0, 1]", "exploration": "[0, 1]", "visits_per_label": "(0, 1000]", "learning_rate": "(0, 1]"}
 _WIDEST, _DEEPEST = 1 << 14, 16
 
@@ -74,7 +76,7 @@ class PolicyIterationConfig:
     """Largest number of states of a part in the memory."""
 
     symmetries: bool = True
-    """Whether mirror images of labelled states are labelled states too."""
+    """Whether mirror images of labelled states are labelled states too; not of several robots with ``multiagent``."""
 
     encoder: Literal["own", "flat"] = "own"
     """Network input: the problem's own, for repair beliefs at offsets from the robot; or the paper's flattened beliefs."""
@@ -116,13 +118,18 @@ class PolicyIterationConfig:
         for name, hint in get_type_hints(type(self)).items():
             object.__setattr__(self, name, _checked(name, getattr(self, name), hint))
 
+    @property
+    def stages(self) -> int | None:
+        """Stages after which a label's trajectory is cut; None: as many as the discount asks for."""
+        return self.label_steps or self.max_steps
+
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
     """A field's value as it is kept."""
     if name in ("max_steps", "label_steps") and value is None:
         return None
     if name in _COUNTS:
-        return check_integer(name, value, 1, _COUNTS[name])
+        return check_integer(name, value, _LEAST.get(name, 1), _COUNTS[name])
     if name in _INTERVALS:
         return check_number(name, value, _INTERVALS[name])
     if get_origin(hint) is Literal:

@@ -190,7 +190,8 @@ class _Graph:
             leaves = {str(key): value.get(key) for key in value.keys(include_nested=True, leaves_only=True)}
             return _content("tensordict", str(tuple(value.batch_size)), groups=leaves.items())
         if type(value) in (dict, types.MappingProxyType):
-            return _content("mapping", groups=value.items())
+            # The order of layers, or of the parts that are sampled from, decides what they give.
+            return _content("mapping", holds=[each for item in value.items() for each in item])
         if type(value) in (list, tuple):
             return _content(type(value).__name__, holds=value)
         if type(value) in (set, frozenset):
@@ -317,11 +318,11 @@ def _state(value: Any) -> list[Any]:
 
 
 def _lasting(kind: type, state: Any) -> Any:
-    """State without cached properties, which may not have been read yet."""
+    """State sorted by name, without cached properties, which may not have been read yet."""
     if not isinstance(state, dict):
         return state
     cached = {name for name in state if isinstance(getattr(kind, str(name), None), functools.cached_property)}
-    return {name: entry for name, entry in state.items() if name not in cached} or None
+    return {name: state[name] for name in sorted(state, key=str) if name not in cached} or None
 
 
 def _codes(code: types.CodeType) -> Iterator[types.CodeType]:

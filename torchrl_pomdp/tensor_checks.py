@@ -96,6 +96,7 @@ def check_tensor(
     dtype: torch.dtype | None = None,
     *,
     finite: bool = True,
+    sparse: bool = False,
 ) -> Tensor:
     """A tensor of a shape.
 
@@ -107,6 +108,7 @@ def check_tensor(
 
     Keyword Args:
         finite: whether all numbers must be finite.
+        sparse: whether it may be a sparse tensor.
 
     Raises:
         TypeError: if it is no such thing.
@@ -124,6 +126,8 @@ def check_tensor(
             value = torch.as_tensor(value, dtype=torch.float64) if exact else read
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise TypeError(f"{name} must be a tensor of numbers, got {shown(value)}") from error
+    if value.layout != torch.strided and not sparse:
+        raise TypeError(f"{name} must be a dense tensor, got one of layout {value.layout}")
     if (
         (dtype is not None and value.dtype != dtype)
         or value.is_complex()

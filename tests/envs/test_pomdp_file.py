@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from torchrl_pomdp.envs import FixedBelief, TabularModel
 from torchrl_pomdp.envs.pomdp_file import parse_pomdp, read_pomdp, write_pomdp
-from torchrl_pomdp.problems import Problem
+from torchrl_pomdp.problems import Problem, tiger
 
 DATA = Path(__file__).parents[1] / "data"
 HEAD = "discount: 0.9\nvalues: cost\nstates: a b\nactions: go stop\nobservations: x y\n"
@@ -345,3 +345,11 @@ def test_files_that_are_none(tmp_path):
     for arguments in ((3,), ("text", 3), ("text", "")):
         with pytest.raises((TypeError, ValueError)):
             parse_pomdp(*arguments)
+
+
+def test_a_start_that_would_be_read_as_another_is_not_written(tmp_path):
+    path = tmp_path / "model.POMDP"
+    model = tiger().model
+    with pytest.raises(ValueError, match=r"start must sum to 1 up to 1e-06 to be read as it is, got 1\.0000"):
+        write_pomdp(path, model, FixedBelief(torch.tensor([0.500005, 0.5])))
+    assert not path.exists()

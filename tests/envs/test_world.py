@@ -11,6 +11,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
+from torchrl.data import Composite
 from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -363,3 +364,15 @@ def test_the_hidden_state_does_not_depend_on_how_the_start_was_drawn():
         for low in (0.0, 0.25, 0.5, 0.75):
             share = hidden[(p >= low) & (p < low + 0.25)].double().mean()
             assert share == pytest.approx(low + 0.125, abs=0.04)
+
+
+def test_a_models_spec_need_not_name_a_device():
+    class Plain(TabularModel):
+        def state_spec(self, batch_size=()):
+            return Composite(dict(super().state_spec(batch_size).items()), shape=batch_size)
+
+    given = tiger().model
+    model = Plain(given.transition, given.observation, given.cost, given.discount)
+    assert model.state_spec().device is None
+    env = TransformedEnv(WorldEnv(model, tiger().start, batch_size=(2,), seed=0), TrackBelief(model))
+    assert env.rollout(3)["belief"].shape == (2, 3, 2)

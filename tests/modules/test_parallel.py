@@ -36,3 +36,12 @@ def test_bad_arguments_are_refused(linear20):
     other = make_problem("linear20").model
     with pytest.raises(ValueError, match="of one model"):
         ParallelRollout([RolloutPolicy(model, GreedyRepair(model)) for model in (linear20.model, other)])
+
+
+def test_steps_of_one_policy_count_once():
+    model = make_problem("line3").model
+    once, twice = (RolloutPolicy(model, GreedyRepair(model), trajectories=2) for _ in range(2))
+    both, y = ParallelRollout([twice, twice]), make_problem("line3").start(torch.arange(3))
+    once(y)
+    both(y)
+    assert both.simulated_steps == 2 * once.simulated_steps

@@ -188,3 +188,18 @@ def test_numbers_that_loops_and_tables_have_read_stay(line3, name):
     with pytest.raises(AttributeError):
         setattr(made, name, 0)
     assert getattr(made, name) == before
+
+
+def test_what_a_policy_writes_is_its_own_affair():
+    """A policy may store what it makes of the belief under the same name; the state goes on from what it was."""
+    problem = tiger()
+
+    def plain(y):
+        belief = y["belief"]
+        return y.set("action", torch.where(belief.amax(-1) > 0.9, 2 - belief.argmax(-1), 0))
+
+    def rounds(y):
+        return plain(y).set("belief", torch.nn.functional.one_hot(y["belief"].argmax(-1), 2).to(y["belief"].dtype))
+
+    costs = [discounted_costs(problem.model, policy, problem.start, num_states=50) for policy in (plain, rounds)]
+    assert torch.equal(*costs)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 
 from torchrl_pomdp.modules import FlatEncoder, MultistepLookahead, PolicyNetwork, RolloutPolicy
@@ -139,3 +139,13 @@ def test_the_regret_of_a_dominated_control_is_at_least_the_largest_known():
     given = batch()
     given["q_factors"][1, 2], given["action_mask"] = math.inf, torch.ones(2, 3, dtype=torch.bool)
     assert ClassificationLoss(Logits([0.0, 0.0, 9.0]), "l2")(given)["regret"] == (16 + 3) / 2
+
+
+@pytest.mark.parametrize("name", ["soft", "cost_weighted", "advantage"])
+def test_no_module_is_taught_illegal_controls(name):
+    """A module that does not mask its logits would take an infinite Q-factor for the best."""
+    plain = TensorDictModule(nn.LazyLinear(3), ["belief"], ["logits"])
+    data = batch().set("belief", torch.rand(2, 4))
+    plain(data.select("belief"))
+    with pytest.raises(ValueError, match=f"q_factors of legal controls must be finite for loss='{name}'"):
+        ClassificationLoss(plain, name)(data)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_pomdp.envs import FixedBelief
+from torchrl_pomdp.envs import FixedBelief, TabularModel
 from torchrl_pomdp.evaluation import discounted_costs, estimate
 from torchrl_pomdp.planners import belief_mdp
 from torchrl_pomdp.problems import tiger
@@ -64,3 +64,30 @@ def test_illegal_controls_are_refused():
     mdp = belief_mdp(tiger().model, HALF)
     with pytest.raises(ValueError, match=r"controls must be legal controls, got 7 at belief 0; legal there: \[0, 1, 2\]"):
         mdp.policy_cost(torch.full((len(mdp),), 7))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_beliefs_of_other_states_are_others_however_near(turned):
+    """What is possible decides what is legal; the answer must not depend on how controls are numbered."""
+    rare = 1e-13
+    moves = torch.zeros(2, 3, 3, dtype=torch.float64)
+    moves[0, 0, 2] = moves[0, 1, 1] = moves[1, 1, 1] = moves[0, 2, 2] = moves[1, 2, 2] = 1.0
+    moves[1, 0, 1], moves[1, 0, 2] = rare, 1.0 - rare
+    cost = torch.tensor([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    legal = torch.tensor([[True, True], [True, False], [True, True]])
+    if turned:
+        moves, cost, legal = moves.flip(0), cost.flip(0), legal.flip(1)
+    seen = torch.ones(2, 3, 1, dtype=torch.float64)
+    model = TabularModel(moves, seen, cost, 0.9, legal=legal, dtype=torch.float64)
+    # Free first, then for ever where control 0 alone is certain to be legal: 10 from there; or 1 and then nothing.
+    assert float(belief_mdp(model, torch.eye(3)[0]).optimal_cost()[0]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("size", [1e-14, 1e-6, 1e6])
+def test_optima_grow_with_the_costs(size):
+    model = random_model(4)
+    smaller = TabularModel(
+        model.transition, model.observation, model.cost * size, model.discount, legal=model.legal, dtype=model.dtype
+    )
+    one, other = (belief_mdp(each, torch.eye(model.num_states)[0]).optimal_cost() for each in (model, smaller))
+    assert torch.allclose(other / size, one, rtol=1e-5)

@@ -414,6 +414,45 @@ def test_a_belief_that_gets_stuck_later_is_refused():
         solve(model, torch.tensor([1.0, 0.0, 0.0]))
 
 
+def one_way_out():
+    """From state 0 control 0 leads to states 1 or 2, unseen, which share no control; control 1 does not."""
+    moves, seen = torch.zeros(2, 5, 5, dtype=torch.float64), torch.zeros(2, 5, 5, dtype=torch.float64)
+    moves[0, 0, 1] = moves[0, 0, 2] = 0.5
+    moves[1, 0, 3] = 1.0
+    moves[:, 1, 1] = moves[:, 2, 2] = moves[:, 3, 4] = moves[:, 4, 3] = 1.0
+    seen[:, [0, 3, 4], [0, 3, 4]] = 1.0
+    seen[:, [1, 2], 1] = 1.0
+    cost = torch.full((2, 5), 5.0, dtype=torch.float64)
+    legal = torch.tensor([[True, True], [True, False], [False, True], [True, False], [False, True]])
+    return TabularModel(moves, seen, cost, 0.9, legal=legal, dtype=torch.float64)
+
+
+def test_a_single_control_that_leads_to_where_none_is_legal_is_refused():
+    with pytest.raises(ValueError, match=r"belief must not lead to one whose states share no legal control, such as \[1, 2\]"):
+        solve(one_way_out(), torch.eye(5)[0])
+
+
+def test_a_policy_plays_nothing_where_nothing_is_legal():
+    model = one_way_out()
+    anything = AlphaVectorPolicy(model, torch.zeros(1, 5), torch.tensor([-1]))
+    with pytest.raises(ValueError, match="no plan is legal"):
+        anything(TensorDict({"belief": torch.tensor([[0.0, 0.5, 0.5, 0.0, 0.0]], dtype=torch.float64)}, [1]))
+    with pytest.raises(ValueError, match="'belief' of y must hold finite numbers"):
+        anything.cost(TensorDict({"belief": torch.full((1, 5), torch.nan, dtype=torch.float64)}, [1]))
+
+
+def test_time_is_kept_where_the_discount_makes_walks_long(monkeypatch):
+    """A clock that goes on with every backup: without it a walk of a hundred thousand beliefs is backed up."""
+    made = []
+    backup = Search.backup
+    monkeypatch.setattr(Search, "backup", lambda self, node: (made.append(node), backup(self, node))[1])
+    monkeypatch.setattr("torchrl_pomdp.planners.exact.monotonic", lambda: float(len(made)))
+    monkeypatch.setattr("torchrl_pomdp.planners.point_based.monotonic", lambda: float(len(made)))
+    # First bounds take no time by this clock; a walk ends at its target.
+    solve(tiger(0.9999).model, torch.tensor([0.5, 0.5]), relative_gap=1e-6, seconds=10.0)
+    assert len(made) == 10
+
+
 @pytest.mark.parametrize("belief", [torch.ones(3) / 3, torch.ones(2, 2, 2) / 2, torch.ones(0, 2)])
 def test_beliefs_of_another_shape_are_refused(belief):
     with pytest.raises(ValueError, match=r"belief must have shape \(2,\) or \(any, 2\), at least one row"):

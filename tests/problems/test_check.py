@@ -324,3 +324,33 @@ def test_wrong_arguments_are_refused():
         check_belief_model(Machine(), 3)
     with pytest.raises(TypeError, match="seed must be an integer"):
         check_belief_model(Machine(), start, seed=0.5)
+
+
+class SeldomOver(TabularModel):
+    """One of many terminal states is left now and then."""
+
+    def is_terminal(self, y):
+        return y["belief"][..., 1:].sum(-1) == 1.0
+
+
+def test_a_single_terminal_state_that_is_left_is_found():
+    size = 48
+    moves = torch.eye(size).expand(1, size, size).clone()
+    moves[0, 0, 1:], moves[0, 0, 0] = 1.0 / (size - 1), 0.0
+    moves[0, 1, 0], moves[0, 1, 1] = 0.04, 0.96
+    cost = torch.zeros(1, size)
+    cost[0, 0] = 1.0
+    model = SeldomOver(moves, torch.eye(size).expand(1, size, size), cost, 0.9)
+    with pytest.raises(AssertionError, match="is_terminal: a terminal state stays terminal"):
+        check_belief_model(model, FixedBelief(torch.eye(size)[0]))
+
+
+class Observes(Machine):
+    """An entry of a name that an environment's own has."""
+
+    state_keys = ("observation",)
+
+
+def test_an_entry_may_not_have_the_name_of_what_is_seen():
+    with pytest.raises((AssertionError, ValueError), match="observation"):
+        check_belief_model(Observes(), start)

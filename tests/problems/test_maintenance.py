@@ -8,7 +8,9 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_pomdp.envs import BeliefEnv
+from torchrl_pomdp.envs.digits import joined
 from torchrl_pomdp.evaluation import discounted_costs, estimate
+from torchrl_pomdp.modules import MultiagentRollout, RolloutPolicy, ZeroCost
 from torchrl_pomdp.problems.check import check_belief_model
 from torchrl_pomdp.problems.maintenance import PeriodicInspection, RandomWear, ReplaceFailed, WearEncoder, maintenance
 from torchrl_pomdp.problems.maintenance_model import INSPECT, REPLACE, Component, MaintenanceModel
@@ -51,7 +53,7 @@ def spelled_out(part, control, levels=3):
 @pytest.mark.parametrize("controls", list(product(range(3), repeat=2)))
 def test_equals_bayes_on_the_joint_chain(controls):
     model, y = small(), random_states(small(), 1)
-    u = model.join_controls(torch.tensor([controls]))
+    u = joined(torch.tensor([controls]), 3)
     joint = [spelled_out(part, control) for part, control in zip(PARTS, controls, strict=True)]
     both = torch.einsum("iax,jby->ijabxy", *joint)
     before = torch.einsum("i,j->ij", *y["belief"][0])
@@ -235,3 +237,14 @@ def test_what_is_written_into_a_chain_later_changes_nothing():
     model = MaintenanceModel([part], 1, penalty=1.0)
     assert model.chain.tolist() == [[pytest.approx([0.9, 0.1]), [0.0, 1.0]]]
     assert not model.chain.requires_grad
+
+
+def test_agents_controls_are_those_of_one_agent():
+    """What is for many agents works for the one there is."""
+    problem = maintenance(3)
+    model, y = problem.model, problem.start(torch.arange(2))
+    every = torch.arange(model.num_controls)
+    assert torch.equal(model.join_controls(model.split_controls(every)), every)
+    base, options = problem.base_policies["failed"], {"trajectories": 1, "max_steps": 30, "terminal_cost": ZeroCost()}
+    in_turn, at_once = (kind(model, base, **options)(y.copy()) for kind in (MultiagentRollout, RolloutPolicy))
+    assert torch.equal(in_turn["action"], at_once["action"])

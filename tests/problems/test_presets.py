@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_pomdp.problems import PRESETS, make_problem, problem_from_spec, rocksample
+from torchrl_pomdp.envs.repair import damage_chain
+from torchrl_pomdp.problems import PRESETS, make_problem, problem_from_spec, repair_problem, rocksample
 
 # States, controls, observations and the model's own description of them.
 SIZES = {
@@ -84,3 +85,8 @@ def test_extensions_are_described_by_plain_json():
     assert model.costs.tolist() == table["costs"]
     with pytest.raises(ValueError, match=r"repair\.repair_probability of spec: repair_probability must be in"):
         problem_from_spec({"repair": {**table, "repair_probability": 0}})
+
+
+def test_a_graph_of_another_library_is_refused_by_name():
+    with pytest.raises(TypeError, match="graph must be a Graph, got"):
+        repair_problem({0: [1]}, chain=damage_chain([0.0, 0.1]), costs=[0.0, 1.0, 2.0], discount=0.9)

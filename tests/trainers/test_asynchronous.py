@@ -312,3 +312,50 @@ def test_no_more_parts_train_at_once_than_there_are_workers(line3, count):
 
     list(asynchronously(line3, workers=Counting()))
     assert max(most) == count
+
+
+def test_no_part_reads_values_that_are_not_there(line3):
+    """Startgame parts end their simulations with value networks of the endgame's, never with the cost of doing nothing."""
+    run, read = asynchronously(line3, papi_t, staleness=2), []
+    collector = run.run._collector
+
+    def noted(index, policy, value, number, cache, part):
+        if run.run.plan[index].truncation is not None:
+            read.extend(value.values[3:])
+        return collector(index, policy, value, number, cache, part)
+
+    run.run._collector = noted
+    list(run)
+    assert len(read) == 3 * 3 * CONFIG.iterations
+    assert all(isinstance(value, LocalNetwork) for value in read)
+
+
+def test_a_run_that_goes_on_remembers_what_was_visited_before(line3, tmp_path, monkeypatch):
+    def visited(config):
+        run = asynchronously(line3, staleness=0, config=config, folder=tmp_path / "run")
+        found, visit = [], run.run._visit
+
+        def noted(policy, number, *part):
+            found.append((number, *part))
+            visit(policy, number, *part)
+
+        monkeypatch.setattr(run.run, "_visit", noted)
+        return run, found
+
+    three = replace(CONFIG, iterations=3)
+    run, first = visited(three)
+    for iteration in run:
+        if iteration.number == 2:
+            break
+    again, found = visited(three)
+    list(again)
+    assert sorted(found) == sorted([(0,), *((number, part) for number in (1, 2) for part in range(6))])
+    assert set(first) <= set(found)
+
+
+def test_labels_without_images_in_other_parts_are_not_kept(line3, monkeypatch):
+    states = []
+    start = AsynchronousIteration._start
+    monkeypatch.setattr(AsynchronousIteration, "_start", lambda self: states.append(start(self)) or states[-1])
+    list(asynchronously(line3, config=replace(CONFIG, iterations=1, symmetries=False)))
+    assert not any(own.blocks for own in states[0].labels)

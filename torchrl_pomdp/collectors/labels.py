@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 
+from torchrl_pomdp import __version__
 from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_path, check_text
 from torchrl_pomdp.collectors.states import StateSampler
 from torchrl_pomdp.envs.belief_env import BeliefEnv
@@ -76,7 +77,7 @@ class LabelCollector(Collector):
         states: the numbered training states.
         label: makes the module that labels feature states from model and policy.
         frames_per_batch: labelled states in each batch.
-        total_frames: labelled states in all; -1 for no end.
+        total_frames: labelled states in all, rounded up to whole batches; -1 for no end.
         num_workers: number of collectors that share the work; this one is number ``worker_idx``.
         cache: folder for labelled blocks; those that an interrupted run has left there are read instead of being labelled
             again, unless they are damaged or another run's. None keeps nothing.
@@ -195,7 +196,7 @@ class LabelCollector(Collector):
 
         def labelled() -> Iterator[tuple[Any, dict[str, Any], bool]]:
             """Handle and report of each block, and whether it comes from the cache, where this labelling has made it."""
-            owner = "" if self.cache is None else digest([self.labeller, self.states])
+            owner = "" if self.cache is None else digest([__version__, self.labeller, self.states])
             for own, path, found in zip(pieces, paths, there, strict=True):
                 content = kept(path, f"{owner} {path.name}", self.env.device) if path is not None and found else None
                 if content is not None:

@@ -42,7 +42,8 @@ class RayWorkers(Workers):
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if ``num_workers`` is not positive, or given for a cluster that is running.
+        ValueError: if ``num_workers`` is not positive, or given for a cluster that is running; or if Ray runs in this process
+            at another address.
         ConnectionError: if there is no cluster at the address.
 
     Examples:
@@ -62,6 +63,8 @@ class RayWorkers(Workers):
         self._own, self._closed = not ray.is_initialized(), False
         if wanted is not None and not (self._own and address is None):
             raise ValueError(f"num_workers is for a cluster that is started here, got {wanted} for one that is running")
+        if not self._own and address is not None:
+            _check_address(address)
         self._actors: dict[int, Any] = {}
         # Reports of tasks that were given out and not collected yet.
         self._given: set[Any] = set()
@@ -162,6 +165,15 @@ class RayWorkers(Workers):
             raise WorkerError(f"{name}: {type(cause).__name__}: {cause}") from error
         except RayError as error:
             raise WorkerError(f"{name}: {type(error).__name__}: {error}") from error
+
+
+def _check_address(address: str) -> None:
+    """Raise if an address is another one than that of the Ray that runs in this process."""
+    running = ray.get_runtime_context().gcs_address
+    host, _, port = address.rpartition(":")
+    here = host in (running.rpartition(":")[0], "localhost", _LOOPBACK)
+    if port.isdigit() and "/" not in host and not (here and port == running.rpartition(":")[2]):
+        raise ValueError(f"address must be that of the Ray that runs in this process, {running}, or None, got {address!r}")
 
 
 def _connect(address: str) -> None:

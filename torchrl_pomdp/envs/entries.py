@@ -14,7 +14,8 @@ __all__ = ["RESERVED", "check_state_entries"]
 
 RESERVED = frozenset(
     {"action", "action_mask", "partition", "logits", "q_factors", "state_value", "cost", "hidden", "told", "priority", "part"}
-    | {"next", "reward", "done", "terminated", "truncated", "step_count", "_reset", "collector", "traj_ids"}
+    | {"observation", "prior"}
+    | {"next", "reward", "done", "terminated", "truncated", "step_count", "_reset", "_step", "collector", "traj_ids"}
     | {"advantage", "value_target", "action_log_prob"}
 )
 """What stands beside a state's entries in the TensorDicts of this library and of TorchRL: no entry has such a name."""

@@ -139,8 +139,8 @@ def write_pomdp(path: str | PathLike[str], model: TabularModel, start: FixedBeli
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if the belief is not one of the model, if a control is not legal everywhere, or if a name does not begin
-            with a letter, is a keyword or becomes another one's.
+        ValueError: if the belief is not one of the model or does not sum to 1 up to rounding, if a control is not legal
+            everywhere, or if a name does not begin with a letter, is a keyword or becomes another one's.
         OSError: if the file cannot be written.
 
     Examples:
@@ -156,6 +156,9 @@ def write_pomdp(path: str | PathLike[str], model: TabularModel, start: FixedBeli
     check_instance("start", start, FixedBelief)
     if len(start.belief) != model.num_states:
         raise ValueError(f"start must be a belief over the model's {model.num_states} states, got {len(start.belief)}")
+    total, allowed = float(start.belief.to(model.dtype).double().sum()), ROUNDING[model.dtype]
+    if abs(total - 1.0) > allowed:
+        raise ValueError(f"start must sum to 1 up to {allowed:g} to be read as it is, got {total:.8g}")
     if not bool(model.legal.all()):
         raise ValueError("model must allow every control in every state: a .POMDP file cannot say which are legal")
     lines = [f"discount: {model.discount!r}", "values: cost"]

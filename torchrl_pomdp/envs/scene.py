@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.data.tensor_specs import TensorSpec
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,7 +50,7 @@ class Scene:
     def __init__(self, model: BeliefModel) -> None:
         self.model = model
         spec = model.state_spec()
-        self._bars = [key for key in model.state_keys if spec[key].dtype.is_floating_point]
+        self._bars = [key for key in model.state_keys if spec[key].dtype.is_floating_point and _shares(spec[key])]
 
     def layout(self) -> dict[str, Any]:
         """What stays the same, as JSON: the names of the bars, and how many are left out."""
@@ -139,3 +141,8 @@ def control_bars(model: BeliefModel, trajectory: TensorDictBase) -> list[list[tu
         names = [", ".join(model.shown_control(torch.tensor(u, device=model.device))) for u in shown]
         bars.append([(name, float(q[u]), u == chosen) for name, u in zip(names, shown, strict=True)])
     return bars
+
+
+def _shares(leaf: TensorSpec) -> bool:
+    """Whether the numbers of an entry lie in [0, 1]."""
+    return isinstance(leaf, Bounded) and bool((leaf.space.low >= 0.0).all() and (leaf.space.high <= 1.0).all())

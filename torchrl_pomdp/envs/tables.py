@@ -233,7 +233,7 @@ def table(
         >>> type(table("transition", torch.eye(3).unsqueeze(0), torch.float32, "cpu")).__name__
         'DenseTable'
     """
-    rows = check_tensor(name, given, finite=False)
+    rows = check_tensor(name, given, finite=False, sparse=True)
     square = rows.ndim == 3 and rows.shape[1] == rows.shape[2]
     if 0 in rows.shape or (not square if like is None else rows.ndim != 3 or rows.shape[:2] != like):
         expected = "[U, n, n], at least one of each" if like is None else f"[{like[0]}, {like[1]}, Z]"

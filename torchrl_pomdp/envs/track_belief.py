@@ -76,7 +76,9 @@ class TrackBelief(Transform):
         if not isinstance(given.get("observation", None), Categorical) or given.get("prior", None) is None:
             raise ValueError("TrackBelief needs a WorldEnv, whose entries are 'observation' and 'prior', beneath it")
         size, shown = self.model.num_observations + 1, given["observation"].n
-        if given["prior"] != self.model.state_spec(given.shape) or shown != size:
+        # A model's spec need not name a device.
+        expected = self.model.state_spec(given.shape).to(self.model.device)
+        if given["prior"].to(self.model.device) != expected or shown != size:
             entries = {key: tuple(leaf.shape[given.ndim :]) for key, leaf in given["prior"].items()}
             raise ValueError(
                 f"model must be of the environment's entries {entries}, their types and its {shown - 1} observations, "

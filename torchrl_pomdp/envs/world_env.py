@@ -26,8 +26,9 @@ class WorldEnv(EnvBase):
 
     The hidden state stays in the environment, out of every TensorDict, so the batch is fixed, and ``step`` goes on from where
     the environment is, whatever is in the TensorDict. It takes every control that can be carried out, and raises at others;
-    random controls are such. A start state is drawn from the generator, and the hidden state from its belief: the start state
-    is what is known beforehand, with the first look in it where the generator gives one.
+    random controls are such, in ``SerialEnv`` and ``ParallelEnv`` only with a :class:`TrackBelief` around it. A start state is
+    drawn from the generator, and the hidden state from its belief: the start state is what is known beforehand, with the first
+    look in it where the generator gives one.
 
     ============ ============ =====================================================================================
     key          shape        meaning

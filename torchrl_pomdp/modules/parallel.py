@@ -60,7 +60,7 @@ class ParallelRollout(TensorDictModuleBase):
     @property
     def simulated_steps(self) -> int:
         """Belief steps simulated so far."""
-        return sum(policy.simulated_steps for policy in self._rollouts())
+        return sum(policy.simulated_steps for policy in set(self._rollouts()))
 
     def _rollouts(self) -> list[RolloutPolicy]:
         return [cast(RolloutPolicy, policy) for policy in self.policies]

@@ -294,7 +294,8 @@ class TruncatedRollout(MakesItsOwn):
         self, y: TensorDictBase, scenarios: Scenarios, age: Tensor, count: int
     ) -> tuple[Tensor, TensorDictBase, Scenarios]:
         """Discounted stage cost ``[N]``, next feature states and scenarios of rows that have made ``age`` ``[N]`` steps."""
-        u = controls_of("base_policy", self.base_policy, y)
+        # A copy: what a policy writes is its own affair.
+        u = controls_of("base_policy", self.base_policy, y.copy())
         if not torch.compiler.is_compiling():
             _check_range(u, self.model)
         noise, scenarios = scenarios.draw(age, self.model.observed(y, u), count)

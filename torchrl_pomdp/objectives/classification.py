@@ -14,7 +14,6 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_choice, check_instance
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.agents import AgentNetwork
-from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.partitioned import PartitionedPolicy
 from torchrl_pomdp.objectives.labels import LabelLoss, check_batch, check_loss, label_of, with_weights, without_modes
 
@@ -114,7 +113,7 @@ class ClassificationLoss(LabelLoss):
         # Each agent's decision is a row.
         label, q_factors, logits = label.flatten(), q_factors.flatten(0, -2), logits.flatten(0, -2)
         gaps = _gaps(q_factors, label)
-        if self.loss in _BY_COST and isinstance(network, LocalNetwork):
+        if self.loss in _BY_COST:
             _check_all_told(q_factors, logits, self.loss)
         chosen = logits.detach().argmax(-1)
         return TensorDict(

@@ -17,9 +17,9 @@ from torchrl_pomdp.tensor_checks import check_distributions, check_tensor
 
 __all__ = ["BeliefMDP", "belief_mdp"]
 
-# Beliefs that agree to so many digits are one.
+# Beliefs of the same states that agree to so many digits are one.
 _DIGITS = 12
-# Costs that agree up to this share are equal: policy iteration then keeps its control.
+# Costs that differ by this share of what costs can add up to are equal: policy iteration then keeps its control.
 _EQUAL = 1e-12
 
 
@@ -83,10 +83,11 @@ class BeliefMDP:
     def optimal_cost(self) -> Tensor:
         r""":math:`J^*` ``[M]``, by policy iteration."""
         controls = self.cost.argmin(-1)
+        equal = _EQUAL * self.cost[self.cost.isfinite()].abs().max() / (1.0 - self.discount)
         while True:
             values = self.policy_cost(controls)
             q = self.q_factors(values)
-            better = q.amin(-1) < values - _EQUAL * values.abs().clamp_min(1.0)
+            better = q.amin(-1) < values - equal
             if not bool(better.any()):
                 return values
             controls = torch.where(better, q.argmin(-1), controls)
@@ -106,7 +107,7 @@ class BeliefMDP:
 def belief_mdp(model: TabularModel, belief: Tensor, *, most: int = 2048) -> BeliefMDP:
     """All beliefs that legal controls can lead to from a start belief, where they are finitely many.
 
-    They are computed in double precision; beliefs that agree to 12 digits are one.
+    They are computed in double precision; beliefs of the same states that agree to 12 digits are one.
 
     Args:
         model: the model.
@@ -134,7 +135,8 @@ def belief_mdp(model: TabularModel, belief: Tensor, *, most: int = 2048) -> Beli
     beliefs: list[Floats] = []
 
     def number(row: Floats) -> int:
-        key = np.round(row, _DIGITS).tobytes()
+        # Which states are possible decides which controls are legal.
+        key = np.flatnonzero(row).tobytes() + np.round(row, _DIGITS).tobytes()
         if key not in known:
             known[key] = len(beliefs)
             beliefs.append(row)

@@ -24,6 +24,7 @@ __all__ = ["AlphaVectorPolicy", "Interval", "Solution", "solve"]
 
 # Vectors whose costs agree up to this share, times 1 - discount, are equal: the first of them is taken.
 _EQUAL = 1e-10
+_NO_PLAN = "y has a belief at which no plan is legal"
 # A trial halves the gap where it starts.
 _TRIAL = 0.5
 
@@ -104,8 +105,10 @@ class AlphaVectorPolicy(TensorDictModuleBase):
         least = cost.amin(-1, keepdim=True)
         # Rounding depends on the batch: of nearly equal ones the first.
         u = self.controls[(cost <= least + self._equal * least.abs()).to(torch.int8).argmax(-1)]
-        first = self.model.action_mask(tensordict).to(torch.int8).argmax(-1)
-        return tensordict.set("action", torch.where(u == ANY, first, u))
+        mask = self.model.action_mask(tensordict)
+        if bool(((u == ANY) & ~mask.any(-1)).any()):
+            raise ValueError(_NO_PLAN)
+        return tensordict.set("action", torch.where(u == ANY, mask.to(torch.int8).argmax(-1), u))
 
     def cost(self, y: TensorDictBase) -> Tensor:
         """Cost of the best plan, float64 ``[*B]``: the policy costs no more.
@@ -133,10 +136,12 @@ class AlphaVectorPolicy(TensorDictModuleBase):
                 f"entry 'belief' of y must have shape {(*y.batch_size, self.model.num_states)}, got {tuple(belief.shape)}; "
                 "for a repair model see joint_belief"
             )
+        if not bool(belief.isfinite().all()):
+            raise ValueError("entry 'belief' of y must hold finite numbers, got others")
         # The marks of illegal plans are small whole numbers, which a product of matrices adds without rounding.
         cost = (belief.double() @ self._costs).masked_fill((belief > 0).float() @ self._illegal > 0, torch.inf)
         if bool(cost.isinf().all(-1).any()):
-            raise ValueError("y has a belief at which no plan is legal")
+            raise ValueError(_NO_PLAN)
         return cost
 
 
@@ -176,7 +181,8 @@ def solve(
     the sawtooth over known beliefs, its corners from the fast informed bound. Controls are those legal in every state of the
     support; negative costs are rewards. All is computed in double precision, with the tables of the model.
 
-    The bounds are certified: each holds at any time, whatever the search has seen. For rounding, the interval is widened by
+    The bounds are certified: each holds at any time, whatever the search has seen, as long as no legal control leads to where
+    there is none. For rounding, the interval is widened by
     the most that it can do to first order, :math:`(16k\epsilon+4s\,10^{-14}+t)\,h/(1-\alpha)`, though never to more than costs
     can add up to. At most k numbers of precision :math:`\epsilon` are added up; s is the size of the largest support that was
     met, beliefs that agree to 14 digits are one; the policy takes plans for equal whose costs agree up to a share t, the larger
@@ -196,8 +202,9 @@ def solve(
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if ``belief`` is no distribution over the states, if it leads to a belief whose states share no legal
-            control, if the model's costs add up to more than a number can hold, or a number is out of range.
+        ValueError: if ``belief`` is no distribution over the states, if the search comes to a belief from where a legal control
+            leads to one whose states share no legal control, if the model's costs add up to more than a number can hold, or a
+            number is out of range.
 
     Examples:
         >>> from torchrl_pomdp.problems import tiger

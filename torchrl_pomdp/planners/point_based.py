@@ -178,7 +178,12 @@ class Search:
             spread = self.table.spread(u, node.states, node.probs)
             probs = spread.sum(1)
             seen = np.flatnonzero(probs > 0)
-            node.edges.append((u, cost, [(int(z), float(probs[z]), self.node(spread[z] / probs[z])) for z in seen]))
+            branches = [(int(z), float(probs[z]), self.node(spread[z] / probs[z])) for z in seen]
+            # Whoever may take any legal control may take this one.
+            for _, _, child in branches:
+                if child.lower == np.inf:
+                    raise _stuck(child)
+            node.edges.append((u, cost, branches))
         if not node.edges:
             raise _stuck(node)
 
@@ -191,7 +196,10 @@ class Search:
             path.append(node)
             target /= self.table.discount
             node = self._next(node, target)
+        # A discount near 1 makes walks long.
         for node in reversed(path):
+            if monotonic() >= until:
+                break
             self.backup(node)
 
     def _next(self, node: Node, target: float) -> Node:

@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_pomdp.checks import check_instance, check_integer, check_number
+from torchrl_pomdp.envs.digits import joined
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.modules.encoders import Encoder
 from torchrl_pomdp.modules.policies import Policy
@@ -69,7 +70,7 @@ class ReplaceFailed(TensorDictModuleBase):
         """Write ``"action"``, int64 ``[*B]``."""
         check_entries("tensordict", tensordict, self.in_keys)
         failed = tensordict.get("belief")[..., -1] > 0.5
-        return tensordict.set("action", self.model.join_controls(failed * REPLACE))
+        return tensordict.set("action", joined(failed * REPLACE, 3))
 
 
 class PeriodicInspection(TensorDictModuleBase):
@@ -111,7 +112,7 @@ class PeriodicInspection(TensorDictModuleBase):
         inspected = (time > 0) & (time % self.period == 0)
         replaced = (belief[-1] > 0.5) | (worn & inspected)
         inspects = ((time + 1) % self.period == 0) & (time + 1 < self.model.num_stages)
-        return tensordict.set("action", self.model.join_controls(torch.where(replaced, REPLACE, inspects * INSPECT)))
+        return tensordict.set("action", joined(torch.where(replaced, REPLACE, inspects * INSPECT), 3))
 
 
 class NewComponents:

@@ -19,6 +19,7 @@ from torchrl.data import Bounded, Categorical, Composite
 
 from torchrl_pomdp.checks import check_integer, check_number, check_sequence
 from torchrl_pomdp.envs.belief_model import BeliefModel
+from torchrl_pomdp.envs.digits import digits
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.envs.world import World
@@ -140,7 +141,7 @@ class MaintenanceModel(BeliefModel):
         prices = torch.tensor([[0.0, part.replacement_cost, part.inspection_cost] for part in components], dtype=torch.float64)
         self.max_cost = float(prices.amax(-1).sum()) + self.penalty
         inspection = torch.stack([part.inspection(self.num_levels) for part in components])
-        controls = _every(3, self.num_components)
+        controls = digits(torch.arange(self.num_controls), 3, self.num_components)
         tables = {
             "chain": chain,
             "success": torch.tensor([[part.success] for part in components], dtype=torch.float64),
@@ -149,7 +150,8 @@ class MaintenanceModel(BeliefModel):
         }
         for name, table in tables.items():
             self.register_buffer(name, table.to(device, dtype), persistent=False)
-        numbers = {"controls": controls, "observations": _every(self.num_levels, self.num_components)}
+        observations = digits(torch.arange(self.num_observations), self.num_levels, self.num_components)
+        numbers = {"controls": controls, "observations": observations}
         for name, table in numbers.items():
             self.register_buffer(name, table.T.contiguous().to(device), persistent=False)
         self._chain_bands, self._inspection_bands = _bands(self.chain), _bands(inspection.to(device, dtype))
@@ -193,13 +195,6 @@ class MaintenanceModel(BeliefModel):
     def is_terminal(self, y: TensorDictBase) -> Tensor:
         """Bool ``[*B]``: all stages are gone."""
         return y.get("time") >= self.num_stages
-
-    def join_controls(self, controls: Tensor) -> Tensor:
-        """Controls ``[*B]`` from those of the components ``[*B, n]``."""
-        joint = controls[..., 0]
-        for component in range(1, self.num_components):
-            joint = joint * 3 + controls[..., component]
-        return joint
 
     def expected_cost(self, y: TensorDictBase, u: Tensor) -> Tensor:
         """Cost of the replacements and inspections, and of the system times P(fewer than k components work); ``[*B]``."""
@@ -341,11 +336,6 @@ def _likelihood(inspection: Tensor) -> Tensor:
     plain = torch.zeros_like(inspection)
     plain[:, :-1, 0] = plain[:, -1, -1] = 1.0
     return torch.stack([plain, inspection]).movedim(2, 0).flatten(1)
-
-
-def _every(base: int, count: int) -> Tensor:
-    """All ``count`` digits to a base, ``[base^count, count]``, the first most significant."""
-    return torch.cartesian_prod(*[torch.arange(base)] * count).view(-1, count)
 
 
 def _named(controls: list[int]) -> str:

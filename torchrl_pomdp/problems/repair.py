@@ -10,7 +10,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_callable, check_flag, check_integer, check_sequence, shown
+from torchrl_pomdp.checks import check_callable, check_flag, check_instance, check_integer, check_sequence, shown
 from torchrl_pomdp.envs.belief_model import StateGenerator
 from torchrl_pomdp.envs.generators import InPart
 from torchrl_pomdp.envs.partition import Partition, SinglePart
@@ -100,6 +100,7 @@ def repair_problem(
         >>> problem.model.partition.num_parts, list(problem.base_policies)
         (6, ['greedy', 'urgency'])
     """
+    check_instance("graph", graph, Graph)
     check_callable("start", start)
     device = check_device("device", device)
     if partition is None and (graph.num_locations < 3 or len(graph.columns.unique()) == 1):

@@ -29,7 +29,7 @@ from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.stopping import Stopped, check_stopped, watching
 from torchrl_pomdp.trainers.parts import PartRecord, records_text, text_records
-from torchrl_pomdp.trainers.plan import Improve
+from torchrl_pomdp.trainers.plan import Evaluate, Improve
 from torchrl_pomdp.trainers.policy_iteration import Iteration, PolicyIteration, judge
 
 __all__ = ["AsynchronousIteration", "Version"]
@@ -116,7 +116,8 @@ class AsynchronousIteration:
     r"""Policy iteration whose parts do not wait for each other.
 
     The networks of every part have a version, 0 for the base policy. To make version :math:`v+1` a part labels with the
-    versions :math:`v_q` of the others that are there when it begins, each at least :math:`v` less ``staleness``. When the last
+    versions :math:`v_q` of the others that are there when it begins, each at least :math:`v` less ``staleness``, and at least 1
+    where its simulations end with value networks of theirs. When the last
     part publishes its version k, the freshest networks of all parts together are iteration k: they are compared with
     the best policy so far, and kept if they are better with confidence, as in :class:`PolicyIteration`. Which networks meet
     depends on time: a seed does not give the same result again.
@@ -173,6 +174,8 @@ class AsynchronousIteration:
             self._restore(run.folder, state)
         best_costs = run._validate(run.base_policy, "base policy")
         run._visit(run.base_policy, 0)
+        for version in list(state.published):
+            self._visit_again(version, state)
         threads = [
             threading.Thread(target=self._improve, args=(part, state), daemon=True) for part in range(len(state.networks))
         ]
@@ -202,6 +205,13 @@ class AsynchronousIteration:
             for thread in threads:
                 thread.join(max(0.0, until - time.monotonic()))
 
+    def _visit_again(self, version: Version, state: _Progress) -> None:
+        """Remember the states that a part has visited for a version that an interrupted run has kept."""
+        if version.number > 1:
+            # Versions of other parts that are lost are made again: then the last ones there are.
+            used = [own[min(number, len(own) - 1)].policy for own, number in zip(state.networks, version.used, strict=True)]
+            self.run._visit(PartitionedPolicy(used), version.number - 1, version.part)
+
     def _meet(self, number: int, state: _Progress) -> list[int]:
         """The versions that are an iteration, once all parts have come that far."""
         with self._changed:
@@ -210,9 +220,23 @@ class AsynchronousIteration:
                 raise state.failure
             return state.met[number - 1]
 
-    def _may_begin(self, number: int, state: _Progress) -> bool:
+    def _may_begin(self, part: int, number: int, state: _Progress) -> bool:
         """Whether a part may begin to make a version, or is to stop."""
-        return state.stop.is_set() or number - 1 - min(state.versions()) <= self.staleness
+        if state.stop.is_set():
+            return True
+        versions = state.versions()
+        return number - 1 - min(versions) <= self.staleness and all(versions[other] for other in self._read_by(part))
+
+    def _read_by(self, part: int) -> set[int]:
+        """Parts where simulations from a part end with value networks of theirs: there must be some."""
+        found: set[int] = set()
+        valued: set[int] = set()
+        for step in self.run.plan:
+            if part in step.parts and step.truncation is not None:
+                found |= valued
+            if isinstance(step, Evaluate):
+                valued |= set(step.parts)
+        return found - {part}
 
     # ---- a part ------------------------------------------------------------------------------------------------------
 
@@ -221,7 +245,7 @@ class AsynchronousIteration:
         try:
             for number in range(len(state.networks[part]), self.run.config.iterations + 1):
                 with self._changed:
-                    self._changed.wait_for(partial(self._may_begin, number, state))
+                    self._changed.wait_for(partial(self._may_begin, part, number, state))
                     used = state.versions()
                     freshest, state.labels[part] = [own[-1] for own in state.networks], _Labels(number)
                 with watching(state.stop):
@@ -263,7 +287,8 @@ class AsynchronousIteration:
             training = run._training(index, part, copy.deepcopy(network), number)
             for block in collector.blocks(run.workers, run._images.counts):
                 check_stopped()
-                state.labels[part].blocks.append((index, block))
+                if sum(block.summary) > block.summary[part]:
+                    state.labels[part].blocks.append((index, block))
                 if block.summary[part]:
                     training.add(part, block.handle)
             for other, block in state.images(part, number, index):

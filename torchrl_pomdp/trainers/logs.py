@@ -8,7 +8,7 @@ from pathlib import Path
 from torchrl.record import CSVLogger
 from torchrl.record.loggers import Logger
 
-__all__ = ["clear_log"]
+__all__ = ["clear_log", "close_log"]
 
 
 def clear_log(logger: Logger | None, name: str) -> None:
@@ -30,9 +30,26 @@ def clear_log(logger: Logger | None, name: str) -> None:
     """
     if not isinstance(logger, CSVLogger):
         return
-    folder = Path(logger.experiment.log_dir) / "scalars" / name
-    # The logger keeps the files open that it has written to.
-    files = logger.experiment.files
-    for path in [path for path in list(files) if Path(path).is_relative_to(folder)]:
-        files.pop(path).close()
-    shutil.rmtree(folder, ignore_errors=True)
+    close_log(logger, name)
+    shutil.rmtree(_folder(logger, name), ignore_errors=True)
+
+
+def close_log(logger: Logger | None, name: str) -> None:
+    """Close the files of a part that is trained: a CSV logger keeps all open that it has written to, and their numbers.
+
+    Args:
+        logger: any logger; all but TorchRL's ``CSVLogger`` are left alone.
+        name: the part, as its scalars are called before the last slash.
+    """
+    if not isinstance(logger, CSVLogger):
+        return
+    folder, experiment = _folder(logger, name), logger.experiment
+    # Parts may be trained side by side.
+    for path in [path for path in list(experiment.files) if Path(path).is_relative_to(folder)]:
+        experiment.files.pop(path).close()
+    for scalar in [scalar for scalar in list(experiment.scalars) if scalar.startswith(f"{name}/")]:
+        del experiment.scalars[scalar]
+
+
+def _folder(logger: CSVLogger, name: str) -> Path:
+    return Path(logger.experiment.log_dir) / "scalars" / name

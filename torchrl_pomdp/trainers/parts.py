@@ -28,6 +28,7 @@ from torchrl_pomdp.modules.threads import kept_threads
 from torchrl_pomdp.problems.problem import Symmetry
 from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.stopping import check_stopped
+from torchrl_pomdp.trainers.logs import close_log
 
 __all__ = ["MEMORY", "PartData", "PartImages", "PartJob", "PartRecord", "Trained", "train_part"]
 
@@ -223,6 +224,7 @@ class PartJob:
             seconds, losses = train_part(data, self.loss(self.network), self.config, **options)
         finally:
             data.close()
+            close_log(logger, self.name)
         return Trained(self.network.state_dict(), seconds, losses)
 
 

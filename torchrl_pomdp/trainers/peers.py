@@ -27,6 +27,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_pomdp import __version__
 from torchrl_pomdp.checks import (
     check_callable,
     check_choice,
@@ -224,7 +225,7 @@ class _Execution:
 
     def outcome(self, name: str, peer: _Peer) -> Outcome:
         """A method's costs, from the folder as far as they are there."""
-        owner = digest([problem_digest(self.problem), name, peer.policy, self.seed])
+        owner = digest([__version__, problem_digest(self.problem), name, peer.policy, self.seed])
         blocks = list(self._blocks(name, peer, owner))
         costs = torch.cat([block["costs"] for block in blocks])
         if self._baseline is None:

@@ -98,11 +98,12 @@ class PolicyIteration:
     An iteration starts from the best policy so far. Its policy is accepted if, on fixed validation states and under the same
     noise, the mean of its costs' paired differences is negative with 95 % confidence. A rejected one is dropped, and the next
     iteration tries again with other training states, those where the rejected one went among them. The value networks are
-    those of the best policy, too. Where ``max_steps`` cut a trajectory its state's pessimistic cost is added, whereas
-    evaluations leave it out where that is a constant.
+    those of the best policy, too. Where ``max_steps`` cut a trajectory its state's pessimistic cost is added, or, in a step
+    with a truncation rule, what the part's value network says once there is one; evaluations leave it out where that is a
+    constant.
 
-    With a ``folder`` every trained part and every block of labels is kept there as soon as it is there. The same iteration
-    with the same folder goes on where an earlier one was interrupted, and gives the same result.
+    With a ``folder`` the networks of every step and every block of labels are kept there as soon as they are there. The same
+    iteration with the same folder goes on where an earlier one was interrupted, and gives the same result.
 
     Args:
         problem: model, start states and training states.
@@ -320,7 +321,7 @@ class PolicyIteration:
         """Collector of the labelled states of a part, all in one batch."""
         config, problem, step = self.config, self.problem, self.plan[index]
         simulation: dict[str, Any] = {
-            "max_steps": config.label_steps or config.max_steps,
+            "max_steps": config.stages,
             "truncation": step.truncation,
             "terminal_cost": value,
             "seed": self._seed(number, "labels", part, index),

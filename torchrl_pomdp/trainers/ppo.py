@@ -20,6 +20,7 @@ from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from torchrl_pomdp import __version__
 from torchrl_pomdp.checks import check_flag, check_instance, check_integer, check_path, check_seed
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.belief_env import BeliefEnv
@@ -115,7 +116,7 @@ def ppo(
     steps, seed = check_integer("steps", steps, size, _MOST), check_seed("seed", seed)
     check_flag("progress", progress)
     batches = steps // size
-    file = None if path is None else _File(path, digest([problem_digest(problem), batches, seed, episodes]))
+    file = None if path is None else _File(path, digest([__version__, problem_digest(problem), batches, seed, episodes]))
     training = Training(problem, batches, seed, episodes)
     if file is not None and file.content is not None:
         training.load_state_dict(file.content)

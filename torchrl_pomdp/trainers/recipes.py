@@ -79,7 +79,7 @@ def multiagent_rollouts(
         ['one-at-a-time', 'order-optimised', 'autonomous']
     """
     check_instance("problem", problem, Problem)
-    steps = check_instance("config", config, PolicyIterationConfig).label_steps
+    steps = check_instance("config", config, PolicyIterationConfig).stages
     options: dict[str, Any] = {"trajectories": trajectories, "max_steps": steps, "terminal_cost": problem.pessimistic_cost}
     return {
         name: MultiagentRollout(problem.model, base_policy, scheme=scheme, **options)
@@ -93,7 +93,7 @@ def r_t(problem: Problem, base_policy: Policy, terminal_cost: TerminalCost, **op
 
     Where a simulation enters a part of an earlier stage, it ends with :math:`\alpha^m\hat J`; those that start in the first
     stage are not cut, since with nothing but :math:`\hat J` after a single step its errors can make a robot walk back and forth
-    for ever.
+    for ever. ``max_steps`` is the horizon unless it is given.
 
     Args:
         problem: the problem; its partition has at least two stages.

@@ -102,7 +102,7 @@ class TrainingRun:
         for name in self.problem.base_policies:
             if is_own(name):
                 raise ValueError(f"base_policies must have names that no policy of a run has, such as 'API 1', got {name!r}")
-        check_integer("states", self.states, 1, MAX_STATES)
+        check_integer("states", self.states, 2, MAX_STATES)
         check_integer("rollout_states", self.rollout_states, 0, MAX_STATES)
         check_integer("online_states", self.online_states, 0, MAX_STATES)
         check_integer("online_trajectories", self.online_trajectories, 1, 10**6)
@@ -214,7 +214,8 @@ class _Execution:
         if several:
             found |= multiagent_rollouts(problem, policy, run.config, run.online_trajectories)
         if problem.model.enumerable:
-            cut = {"max_steps": run.config.label_steps, "terminal_cost": problem.pessimistic_cost} if several else {}
+            stages = run.config.stages
+            cut = {} if stages is None else {"max_steps": stages, "terminal_cost": problem.pessimistic_cost}
             found["R-NT"] = r_nt(problem, policy, trajectories=run.online_trajectories, **cut)
         return found
 

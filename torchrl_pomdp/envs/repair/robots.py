@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_pomdp.checks import check_integer, shown
+from torchrl_pomdp.checks import shown
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.names import number_of
 from torchrl_pomdp.envs.repair.graphs import Graph
@@ -61,8 +61,9 @@ class Robots(BeliefModel):
             TypeError: if it is of another kind.
             ValueError: if there is no such control, or not one for each robot.
         """
-        if isinstance(control, Integral) and self.enumerable:
-            return torch.tensor(check_integer("control", control, 0, self.num_controls - 1), device=self.device)
+        number = isinstance(control, Integral) or (isinstance(control, Tensor) and control.shape == ())
+        if number and self.enumerable:
+            return torch.tensor(number_of("control", control, None, self.num_controls), device=self.device)
         each = self._each("control", control)
         names, count = self.graph.control_names, self.num_robot_controls
         numbers = [number_of(f"control of robot {robot}", given, names, count) for robot, given in enumerate(each)]

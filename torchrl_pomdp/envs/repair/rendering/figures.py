@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl_pomdp.checks import check_instance
 from torchrl_pomdp.envs.repair.model import REPAIR, RepairModel
 from torchrl_pomdp.envs.repair.rendering.network import DAMAGE, DAMAGE_LABEL, ROBOT, damage_norm, draw_network, scale_of
-from torchrl_pomdp.envs.repair.rendering.played import check_moves, expected_damage
+from torchrl_pomdp.envs.repair.rendering.played import check_moves, expected_damage, of_one_trajectory
 from torchrl_pomdp.pictures import new_figure
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def trajectory_figure(model: RepairModel, trajectory: TensorDictBase, title: str
 
     Raises:
         TypeError: if something is of the wrong kind.
-        ValueError: if an entry is missing.
+        ValueError: if an entry is missing or none of the model, or it is not a single trajectory.
         ImportError: if matplotlib, the extra ``plot``, is not installed.
     """
     check_instance("model", model, RepairModel)
@@ -46,15 +46,14 @@ def trajectory_figure(model: RepairModel, trajectory: TensorDictBase, title: str
     ]
     if missing:
         raise ValueError(f"trajectory must have the entry {missing[0]!r}, got {sorted(map(str, trajectory.keys()))}")
-    steps = trajectory.batch_size[0]
-    damage = expected_damage(model, trajectory["belief"])
+    states, controls = of_one_trajectory(model, "trajectory", trajectory)
+    steps, damage = trajectory.batch_size[0], expected_damage(model, states["belief"])
     figure = new_figure(max(5.0, 0.14 * steps + 2.5), max(2.5, 0.16 * model.num_locations + 1.2))
     axes = figure.add_subplot()
     image = axes.imshow(
         damage.T.cpu().numpy(), aspect="auto", cmap=DAMAGE, vmin=0, vmax=model.num_levels - 1, interpolation="nearest"
     )
     figure.colorbar(image, ax=axes, label=DAMAGE_LABEL)
-    controls = model.split_controls(trajectory["action"])
     for robot in range(model.num_robots):
         path = trajectory["location"][:, robot].cpu().numpy()
         axes.plot(range(steps), path, color=ROBOT, linewidth=1.2, label=f"robot {robot + 1}")

@@ -44,19 +44,12 @@ def played(model: RepairModel, name: str, trajectory: TensorDictBase) -> Played:
     """A trajectory, checked, with the discounted cost before each stage."""
     check_text("key of trajectories", name)
     what = f"trajectories[{name!r}]"
-    if len(trajectory.batch_size) != 1 or not trajectory.batch_size[0]:
-        raise ValueError(f"{what} must be one trajectory of at least one stage, got batch {tuple(trajectory.batch_size)}")
-    states, truth = _states(model, what, trajectory), _truth(model, what, trajectory)
+    states, controls = of_one_trajectory(model, what, trajectory)
+    truth, action = _truth(model, what, trajectory), trajectory["action"]
     if "next" in trajectory:
         states = torch.cat([states, _states(model, f"next of {what}", trajectory["next"])[-1:]])
         last = None if truth is None else _truth(model, f"next of {what}", trajectory["next"])
         truth = None if truth is None or last is None else torch.cat([truth, last[-1:]])
-    shape = (*trajectory.batch_size, *model.control_shape)
-    action = check_tensor(f"action of {what}", trajectory.get("action", None), shape, torch.int64)
-    wrong = action[(action < 0) | (action >= model.control_range)]
-    if len(wrong):
-        raise ValueError(f"action of {what} must be in 0..{model.control_range - 1}, got {int(wrong[0])}")
-    controls = model.split_controls(action.to(model.device))
     check_moves(f"action of {what}", model, states["location"][: len(controls)], controls)
     # As the environment has it: no cost follows a terminal state.
     costs = model.expected_cost(states).masked_fill(model.is_terminal(states), 0.0).double()
@@ -65,6 +58,18 @@ def played(model: RepairModel, name: str, trajectory: TensorDictBase) -> Played:
     captions = [f"stage {stage}, cost so far {cost:.5g}" for stage, cost in enumerate(before)]
     damage, location = expected_damage(model, states["belief"]).cpu(), states["location"].cpu()
     return Played(name, captions, damage, location, controls.cpu(), truth, _bars(model, what, trajectory, action))
+
+
+def of_one_trajectory(model: RepairModel, what: str, trajectory: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+    """Core entries ``[T]`` and robots' controls ``[T, R]`` of a single trajectory; raises where they are none of the model."""
+    if len(trajectory.batch_size) != 1 or not trajectory.batch_size[0]:
+        raise ValueError(f"{what} must be one trajectory of at least one stage, got batch {tuple(trajectory.batch_size)}")
+    states, shape = _states(model, what, trajectory), (*trajectory.batch_size, *model.control_shape)
+    action = check_tensor(f"action of {what}", trajectory.get("action", None), shape, torch.int64)
+    wrong = action[(action < 0) | (action >= model.control_range)]
+    if len(wrong):
+        raise ValueError(f"action of {what} must be in 0..{model.control_range - 1}, got {int(wrong[0])}")
+    return states, model.split_controls(action.to(model.device))
 
 
 def _states(model: RepairModel, what: str, given: TensorDictBase) -> TensorDictBase:
