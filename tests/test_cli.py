@@ -119,7 +119,7 @@ def test_evaluate_by_name_and_online(policy, capsys):
     ("args", "message"),
     [
         ("train nosuch", "a file .toml or .POMDP, or module:function, got 'nosuch'"),
-        ("train line3 --states 0", "states must be at least 1, got 0"),
+        ("train line3 --states 0", "states must be at least 2, got 0"),
         ("train line3 --rollout-states -5", "rollout_states must be at least 0, got -5"),
         ("train line3 --online-states -5", "online_states must be at least 0, got -5"),
         ("train line3 --iterations 0", "iterations must be at least 1, got 0"),
