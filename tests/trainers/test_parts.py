@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torchrl.record import CSVLogger
 
 from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.trainers import PolicyIterationConfig, papi_nt, parts
 from torchrl_pomdp.trainers.parts import PartData, PartImages
+from torchrl_pomdp.trainers.recipes import multiagent_rollouts
 
 CONFIG = PolicyIterationConfig(iterations=1, samples_per_part=90, validation_states=20, epochs=1, least_steps=8)
 
@@ -65,3 +67,20 @@ def test_the_order_does_not_depend_on_the_blocks(problem):
         found.append(torch.cat(list(data))["belief"])
     assert torch.equal(*found)
     assert images.counts(y) == [0, 200, 0, 0, 0, 0]
+
+
+def test_files_of_losses_are_closed_once_a_part_is_trained(problem, tmp_path):
+    """Else a run of many parts and iterations ends at the system's limit of open files."""
+    config = PolicyIterationConfig(iterations=1, samples_per_part=20, least_steps=60, epochs=1, validation_states=10)
+    logger = CSVLogger("log", log_dir=str(tmp_path))
+    list(papi_nt(problem, config, GreedyRepair(problem.model), logger=logger))
+    assert list((tmp_path / "log" / "scalars").rglob("*.csv"))
+    assert not logger.experiment.files
+    assert not logger.experiment.scalars
+
+
+def test_online_rollout_is_cut_as_labels_are(problem):
+    """Where the discount asks for too many stages, those that are given count online too."""
+    config = PolicyIterationConfig(max_steps=20)
+    rollouts = multiagent_rollouts(problem, GreedyRepair(problem.model), config, 1)
+    assert {rollout.cost_to_go.max_steps for rollout in rollouts.values()} == {20}
