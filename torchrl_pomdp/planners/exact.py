@@ -136,8 +136,7 @@ class AlphaVectorPolicy(TensorDictModuleBase):
                 f"entry 'belief' of y must have shape {(*y.batch_size, self.model.num_states)}, got {tuple(belief.shape)}; "
                 "for a repair model see joint_belief"
             )
-        if not bool(belief.isfinite().all()):
-            raise ValueError("entry 'belief' of y must hold finite numbers, got others")
+        check_tensor("entry 'belief' of y", belief)
         # The marks of illegal plans are small whole numbers, which a product of matrices adds without rounding.
         cost = (belief.double() @ self._costs).masked_fill((belief > 0).float() @ self._illegal > 0, torch.inf)
         if bool(cost.isinf().all(-1).any()):
