@@ -69,6 +69,15 @@ def test_the_order_does_not_depend_on_the_blocks(problem):
     assert images.counts(y) == [0, 200, 0, 0, 0, 0]
 
 
+def test_every_step_is_of_a_whole_batch(problem):
+    """A rest of one state would else be every second step of 257 states by batches of 256."""
+    y = problem.training[0](torch.arange(9)).set("number", torch.arange(9))
+    buffer = parts._filled(y, 4, seed=0)
+    passes = [buffer.sample()["number"].tolist() + buffer.sample()["number"].tolist() for _ in range(20)]
+    assert all(len(set(seen)) == 8 for seen in passes), "no state twice in a pass"
+    assert {number for seen in passes for number in seen} == set(range(9)), "another one is left out in each"
+
+
 def test_files_of_losses_are_closed_once_a_part_is_trained(problem, tmp_path):
     """Else a run of many parts and iterations ends at the system's limit of open files."""
     config = PolicyIterationConfig(iterations=1, samples_per_part=20, least_steps=60, epochs=1, validation_states=10)

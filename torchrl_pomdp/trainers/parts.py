@@ -295,7 +295,8 @@ def _filled(batch: TensorDictBase | PartData, size: int, seed: int) -> TensorDic
         storage = LazyTensorStorage(len(batch), device=device)
     buffer = TensorDictReplayBuffer(
         storage=storage,
-        sampler=SamplerWithoutReplacement(),
+        # A last batch of a few states would count as a full step; the states it leaves out differ from pass to pass.
+        sampler=SamplerWithoutReplacement(drop_last=True),
         batch_size=size,
         generator=torch.Generator(device).manual_seed(seed),
     )
