@@ -103,7 +103,7 @@ class PolicyIterationConfig:
     """States of each part in an optimisation step."""
 
     epochs: int = 6
-    """Passes over the labelled states."""
+    """Passes over the labelled states; each leaves out what is less than a batch."""
 
     least_steps: int = 1500
     """Optimisation steps of each network at least, however few the labelled states are."""
