@@ -4,6 +4,7 @@ import ast
 import inspect
 import io
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -180,6 +181,14 @@ def test_ctrl_c_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(commands, "train", interrupt)
     assert main(["train", "line3"]) == 130
     assert capsys.readouterr().err.split("\n") == ["", "torchrl-pomdp: interrupted; the same command goes on", ""]
+
+
+def test_a_reader_that_has_gone_ends_it_quietly():
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write) as output:
+        done = subprocess.run([sys.executable, "-m", "torchrl_pomdp.cli", "problems"], stdout=output, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (141, b"")
 
 
 @pytest.mark.parametrize("content", ["", "[1]", '[{"parts": {"a": {}}}]', "[" * 100_000])

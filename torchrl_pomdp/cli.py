@@ -7,6 +7,7 @@ Nothing that takes long to import is imported before the arguments are read.
 from __future__ import annotations
 
 import io
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -203,7 +204,7 @@ class Problems:
 
 def main(args: list[str] | None = None) -> int:
     """Run the command with ``args`` (default: the process's); returns the exit status: 2 for input that was refused, 1 for
-    work that has failed elsewhere, 130 for Ctrl-C.
+    work that has failed elsewhere, 130 for Ctrl-C, 141 if nobody reads the output any more.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         # What a terminal cannot show is no reason to lose a table.
@@ -248,6 +249,11 @@ def main(args: list[str] | None = None) -> int:
             commands.report(command)
         else:
             commands.problems()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # As by `| head`. What is left to write goes nowhere, so that the interpreter need not complain about it at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except (ValueError, TypeError, OSError, ImportError) as error:
         print(f"torchrl-pomdp: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

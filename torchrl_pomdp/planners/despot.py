@@ -35,7 +35,8 @@ class DESPOT(TreeSearch):
     the cost of the best policy from above, and ``bound`` from below. Explorations follow the control of the lowest lower
     bound and the observation of the largest gap, and stop where the gap is a share ``gap`` of the root's. A policy tree is
     charged ``regularisation`` for each of its nodes, so that what few scenarios suggest is not overrated. Where no tree is
-    better than the base policy, its control is chosen; of controls that cost the same, the lower one.
+    better than the base policy, its control is chosen; of controls that cost the same, the lower one. With random play and
+    trivial bounds an exploration goes down to depth D; a decision needs time for several, or what they explored is overrated.
 
     Args:
         model: the belief model; it needs a scalar twin, as repair and tabular models have.
