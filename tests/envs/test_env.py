@@ -5,6 +5,7 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_pomdp.envs import BeliefEnv, FixedBelief
@@ -139,3 +140,18 @@ def test_rewards_that_are_no_numbers_are_refused():
     env = BeliefEnv(model, RandomState(model), batch_size=(40,), seed=0)
     with pytest.raises(ValueError, match="expected_cost of the model must be finite, got inf"):
         env.rollout(5)
+
+
+@pytest.mark.filterwarnings("ignore:A reset tensordict carrying state:FutureWarning")
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: TransformedEnv(env, StepCounter())])
+def test_flags_beside_states_are_refused(wrap):
+    """TorchRL would set the states that are there, and rows that are over would stay so."""
+    problem = make_problem("line3")
+    env = wrap(BeliefEnv(problem.model, problem.start, batch_size=(2,), seed=0))
+    y = env.reset().set("_reset", torch.tensor([[True], [False]]))
+    for options in ({}, {"set_state": True}):
+        with pytest.raises(ValueError, match="tensordict has states and the flags '_reset'"):
+            env.reset(y.clone(), **options)
+    after = env.reset(y.clone(), set_state=False)
+    assert not torch.equal(after["belief"][0], y["belief"][0])
+    assert torch.equal(after["belief"][1], y["belief"][1])

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 import pickle
+from itertools import pairwise
 
 import pytest
 import torch
 from tensordict import TensorDict
 
 from torchrl_pomdp.envs import TabularModel
-from torchrl_pomdp.envs.repair import RepairModel, UniformStart, damage_chain, joint_belief, line, tabular_model
+from torchrl_pomdp.envs.repair import Graph, RepairModel, UniformStart, damage_chain, joint_belief, line, tabular_model
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.modules import Myopic
 from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
@@ -372,3 +373,18 @@ def test_all_is_over_once_nothing_is_damaged_though_level_0_costs():
     found = solve(tabular_model(model), joint_belief(model, y))
     assert list(found.interval) == pytest.approx([21.0, 21.0], rel=0.005)
     assert DESPOT(model, GreedyRepair(model), simulations=20)(y[None])["q_factors"].min() == 21.0
+
+
+@pytest.mark.parametrize("size", [63, 64])
+def test_locations_that_share_a_bit_do_not_break_the_relaxation(size):
+    """On the path 1 - 0 - z - 2 - ... the robot looks at 0 on its way to z; with 64 locations they share a bit."""
+    last = size - 1
+    path = [1, 0, last, *range(2, last)]
+    graph = Graph.from_edges("path", size, list(pairwise(path)))
+    model = RepairModel(graph, damage_chain((0.0, 0.0)), (0.0, 1.0, 100.0), 0.95)
+    belief = torch.eye(3)[0].repeat(1, size, 1)
+    belief[0, last] = torch.tensor([0.0, 0.5, 0.5])
+    y = TensorDict({"belief": belief, "location": torch.tensor([[1]])}, [1])
+    for seed in range(20):
+        low, high = DESPOT(model, GreedyRepair(model), simulations=5, scenarios=1, seed=seed).bounds(y)
+        assert 0.0 < float(low) <= float(high)

@@ -48,7 +48,8 @@ class BeliefEnv(EnvBase):
     Raises:
         TypeError: if an argument is of the wrong kind.
         ValueError: if a size is not positive or the seed is negative; by ``step`` if a control is illegal or a state is none
-            of the model's, by ``reset`` if a given or generated state is none.
+            of the model's, by ``reset`` if a given or generated state is none, or
+            states are given with flags ``"_reset"``.
 
     Examples:
         >>> from torchrl_pomdp.problems import make_problem
@@ -111,12 +112,18 @@ class BeliefEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         shape = self.batch_size if tensordict is None else tensordict.batch_size
+        flags = None if tensordict is None else tensordict.get("_reset", None)
+        if set_state and flags is not None:
+            # TorchRL 0.14 sets the state of any TensorDict that holds one, and so finished rows would stay where they are.
+            raise ValueError(
+                "tensordict has states and the flags '_reset': reset(tensordict, set_state=False) draws flagged rows anew, "
+                "reset(tensordict.exclude('_reset'), set_state=True) sets the states"
+            )
         if set_state and tensordict is not None:
             y = self.model.with_features(tensordict)
         else:
             keys = torch.randint(-(2**62), 2**62, tuple(shape), generator=self.rng, device=self.device)
             y = self.model.derive(self.model.drawn(self.generator, keys))
-        flags = None if tensordict is None else tensordict.get("_reset", None)
         self._controls.show(y.get("action_mask"), flags)
         return self._with_done(y)
 

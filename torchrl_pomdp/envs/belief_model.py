@@ -208,7 +208,8 @@ class BeliefModel(JointControls, ABC):
 
         Simulations compare controls under common random numbers: in one scenario, whoever observes a variable first finds
         it in the same state, see :mod:`torchrl_pomdp.modules.scenarios`. By default each uniform has a hidden variable of its
-        own; uniforms of one name are equal.
+        own. Uniforms of one name are equal where it is observed for the first time; later ones are not. Names are below
+        :math:`2^{32}`.
         """
         return torch.arange(self.noise_dim, device=self.device).expand(*y.batch_size, self.noise_dim)
 

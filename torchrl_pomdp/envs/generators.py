@@ -213,5 +213,6 @@ class FixedBelief:
 
 def draw_each(generators: Sequence[StateGenerator], which: Tensor, keys: Tensor) -> TensorDictBase:
     """States ``[N]`` for keys ``[N]``, the i-th from the generator number ``which[i]``."""
-    drawn = [generated(generator, keys[which == i]) for i, generator in enumerate(generators) if bool((which == i).any())]
+    used = [i for i in range(len(generators)) if bool((which == i).any())] or [0]
+    drawn = [generated(generators[i], keys[which == i]) for i in used]
     return torch.cat(drawn, 0)[which.argsort(stable=True).argsort()]

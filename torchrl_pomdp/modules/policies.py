@@ -55,9 +55,10 @@ def check_policy(name: str, policy: Any, model: BeliefModel) -> Any:
     """
     check_callable(name, policy)
     num_parts = getattr(policy, "num_parts", None)
-    parts = 1 if model.partition is None else model.partition.num_parts
+    parts = 0 if model.partition is None else model.partition.num_parts
     if num_parts is not None and num_parts != parts:
-        raise ValueError(f"{name} must have a local module for each of the model's {parts} parts, got {num_parts}")
+        whose = f"each of the model's {parts} parts" if parts else "parts of a partition, which the model does not have"
+        raise ValueError(f"{name} must have local modules for {whose}, got {num_parts}")
     return policy
 
 

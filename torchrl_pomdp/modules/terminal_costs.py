@@ -65,6 +65,8 @@ class ConstantCost(ClosedFormCost):
         self.dtype = check_instance("model", model, BeliefModel).dtype
         self.in_keys = list(model.state_keys[:1])
         self._cost = check_number("cost", cost, "(-inf, inf)")
+        if abs(self._cost) > torch.finfo(self.dtype).max:
+            raise ValueError(f"cost must be finite in {self.dtype}, got {self._cost}")
 
     @property
     def cost(self) -> float:

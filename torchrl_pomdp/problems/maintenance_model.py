@@ -140,6 +140,8 @@ class MaintenanceModel(BeliefModel):
             raise ValueError(f"components must have at most {_MOST} joint controls, and as many observations, got {sizes}")
         prices = torch.tensor([[0.0, part.replacement_cost, part.inspection_cost] for part in components], dtype=torch.float64)
         self.max_cost = float(prices.amax(-1).sum()) + self.penalty
+        if not self.max_cost <= torch.finfo(dtype).max:
+            raise ValueError(f"penalty and costs of the components must be finite in {dtype}, got {self.max_cost} in all")
         inspection = torch.stack([part.inspection(self.num_levels) for part in components])
         controls = digits(torch.arange(self.num_controls), 3, self.num_components)
         tables = {

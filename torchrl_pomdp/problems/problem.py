@@ -111,7 +111,10 @@ class Problem:
             object.__setattr__(self, "spec", copy.deepcopy(check_mapping("spec", self.spec, object)))
         if self.pessimistic_cost is None:
             bound = model.max_cost if model.max_cost is not None else _largest_cost(model, self.start)
-            self._set(pessimistic_cost=ConstantCost(model, (bound or 1.0) / (1.0 - model.discount)))
+            for_ever = (bound or 1.0) / (1.0 - model.discount)
+            if not for_ever <= torch.finfo(model.dtype).max:
+                raise ValueError(f"cost of the model, paid for ever, must be finite in {model.dtype}, got {for_ever}")
+            self._set(pessimistic_cost=ConstantCost(model, for_ever))
         check_instance("pessimistic_cost", self.pessimistic_cost, ClosedFormCost)
         _check_positive(self.pessimistic_cost, self.start, model.device)
 

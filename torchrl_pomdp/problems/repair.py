@@ -57,6 +57,11 @@ _PLACES = (
 _OBSTACLES = ((1, 1), (1, 2), (3, 1), (4, 3), (4, 4), (2, 4))
 
 
+def has_six_parts(graph: Graph) -> bool:
+    """Whether each of the six parts of Section VI-B has states: three locations or more, not all in one column."""
+    return graph.num_locations >= 3 and len(graph.columns.unique()) > 1
+
+
 def repair_problem(
     graph: Graph,
     chain: Tensor,
@@ -103,11 +108,9 @@ def repair_problem(
     check_instance("graph", graph, Graph)
     check_callable("start", start)
     device = check_device("device", device)
-    if partition is None and (graph.num_locations < 3 or len(graph.columns.unique()) == 1):
-        # Some of the six parts would have no states.
-        partition = SinglePart()
     if partition is None:
-        partition = RepairPartition(graph, check_tensor("costs", costs, finite=False), device=device)
+        six = has_six_parts(graph)
+        partition = RepairPartition(graph, check_tensor("costs", costs, finite=False), device=device) if six else SinglePart()
     model = RepairModel(
         graph,
         chain,

@@ -17,7 +17,7 @@ from torchrl_pomdp.envs.pomdp_file import parse_pomdp
 from torchrl_pomdp.envs.tabular import TabularModel
 from torchrl_pomdp.problems.presets import PRESETS, fixed_options, make_problem
 from torchrl_pomdp.problems.problem import Problem
-from torchrl_pomdp.problems.repair import GRAPHS, STARTS, chain_of, repair_problem
+from torchrl_pomdp.problems.repair import GRAPHS, STARTS, chain_of, has_six_parts, repair_problem
 from torchrl_pomdp.tensor_checks import check_device
 
 __all__ = ["SpecError", "problem_from_spec"]
@@ -178,9 +178,11 @@ def _repair(value: Any, _: Mapping[str, Any], device: torch.device) -> Problem:
     graph = _checked(("repair", "graph"), "", lambda: GRAPHS[kind](table["graph"][kind], **options))
     starts = table.get("start", {"calibrated": 0.7})
     started, more = _one_of(("repair", "start"), starts, STARTS)
-    partition = table.get("partition", "six")
-    if partition not in ("six", "single"):
+    partition = table.get("partition")
+    if partition not in (None, "six", "single"):
         raise SpecError(("repair", "partition"), f"must be one of six, single, got {shown(partition)}")
+    if partition == "six" and not has_six_parts(graph):
+        raise SpecError(("repair", "partition"), f"must be single: of six, some parts of the {graph.name} have no states")
     return _checked(
         ("repair",),
         "start",

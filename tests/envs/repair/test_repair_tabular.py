@@ -7,8 +7,11 @@ import torch
 from _oracles import brute_force, random_states, small_model, varied_model
 from tensordict import TensorDict
 
-from torchrl_pomdp.envs.repair import Graph, UniformStart, damage_chain, grid, line
+from benchmarks.setting import by_tensors
+from torchrl_pomdp.envs.repair import Graph, RepairModel, UniformStart, damage_chain, grid, line
 from torchrl_pomdp.envs.repair.tabular import joint_belief, tabular_model
+from torchrl_pomdp.modules import TruncatedRollout
+from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import make_problem
 
 GRAPHS = {
@@ -168,3 +171,25 @@ def test_what_is_legal_without_restrictions_is_so_in_the_table():
     table = tabular_model(model)
     mask = table.action_mask(TensorDict({"belief": joint_belief(model, y)}, [1]))
     assert mask.tolist() == model.action_mask(y).tolist() == [[True, False, True]]
+
+
+def test_intact_locations_that_cost_something_are_paid_for_ever():
+    """One law for beliefs, hidden states and tables: nothing is terminal where level 0 costs something."""
+    model = RepairModel(line(2), damage_chain((0.0,)), (1.0, 5.0), 0.9, dtype=torch.float64)
+    intact = torch.tensor([[[1.0, 0.0], [1.0, 0.0]], [[0.5, 0.5], [0.5, 0.5]]], dtype=torch.float64)
+    y = model.with_features(TensorDict({"belief": intact, "location": torch.tensor([[0], [0]])}, [2]))
+    table, u = tabular_model(model, start_observed=False), torch.tensor([1, 0])
+    joint = table.with_features(TensorDict({"belief": joint_belief(model, y, start_observed=False)}, [2]))
+    assert not model.ends
+    assert not model.is_terminal(y).any()
+    assert not table.is_terminal(joint).any()
+    assert model.expected_cost(y, u).tolist() == pytest.approx([2.0, 6.0])
+    assert table.expected_cost(joint, u).tolist() == pytest.approx([2.0, 6.0])
+    world = model.world()
+    hidden = TensorDict({"level": torch.zeros(1, 2, dtype=torch.int64), "location": torch.tensor([[0]])}, [1])
+    assert not world.is_terminal(hidden).any()
+    assert float(world.step(hidden, torch.tensor([2]), torch.arange(1))[0]) == pytest.approx(2.0)
+    # For ever 2 a stage: both engines, cut after 300 stages.
+    rollout = TruncatedRollout(model, GreedyRepair(model), max_steps=300)
+    for each in (rollout, by_tensors(rollout)):
+        assert float(each(y[:1], torch.arange(1))) == pytest.approx(20.0, rel=1e-9)

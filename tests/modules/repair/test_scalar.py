@@ -23,11 +23,21 @@ from torch.nn import functional as F
 
 from benchmarks.setting import by_tensors
 from torchrl_pomdp.envs import FunctionPartition, SinglePart
-from torchrl_pomdp.envs.repair import CalibratedStart, Graph, RepairModel, RepairPartition, damage_chain, grid, line
+from torchrl_pomdp.envs.repair import (
+    CalibratedStart,
+    Graph,
+    RandomState,
+    RepairModel,
+    RepairPartition,
+    damage_chain,
+    grid,
+    line,
+)
 from torchrl_pomdp.modules import (
     AfterSteps,
     ConstantCost,
     FlatEncoder,
+    MultiagentRollout,
     MultistepLookahead,
     OnEntering,
     OnLeaving,
@@ -791,3 +801,37 @@ def test_as_many_trajectories_as_the_time_allows():
     plenty = list(allocation._replace(seconds=1e6).stretches())
     assert np.concatenate(plenty).tolist() == [4] * 25
     assert len(plenty) < 8
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_where_no_level_costs_more_nothing_is_urgent(dtype):
+    """Damage at locations whose levels all cost the same is no target, to the last bit."""
+    chain = torch.tensor([[0.7948, 0.2052, 0.0], [0.0, 0.8731, 0.1269], [0.0723, 0.018, 0.9097]], dtype=torch.float64)
+    dear, same = [0.0, 1.0, 10.0], [0.7, 0.7, 0.7]
+    costs = torch.tensor([*[same] * 4, dear, *[same] * 3, dear])
+    model = RepairModel(grid(3, 3), chain / chain.sum(-1, keepdim=True), costs, 0.9, num_robots=3, dtype=dtype)
+    y, keys = RandomState(model)(torch.arange(1000)), torch.arange(1000)
+    rollout = TruncatedRollout(model, UrgencyRepair(model))
+    assert_close(rollout(y, keys), by_tensors(rollout)(y, keys))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_more_observations_than_can_be_gone_through_are_refused(compiled):
+    problem = make_problem("network32x8")
+    policy = MultiagentRollout(
+        problem.model, GreedyRepair(problem.model), trajectories=1, max_steps=1, terminal_cost=ZeroCost(), leaves="observation"
+    )
+    policy = policy if compiled else by_tensors(policy)
+    assert (policy.cost_to_go.scalar is not None) == compiled
+    with pytest.raises(ValueError, match=r"num_observations must be at most 4096 .*, got 5\^8 = 390625"):
+        policy(problem.start(torch.arange(1)))
+
+
+def test_local_modules_need_a_partition():
+    own = make_problem("line3").model
+    model = RepairModel(own.graph, own.chain.double(), own.costs, own.discount)
+    rule = r"must have local modules for parts of a partition, which the model does not have, got 1"
+    with pytest.raises(ValueError, match="base_policy " + rule):
+        RolloutPolicy(model, PartitionedPolicy([GreedyRepair(model)]))
+    with pytest.raises(ValueError, match="terminal_cost " + rule):
+        RolloutPolicy(model, GreedyRepair(model), max_steps=2, terminal_cost=PartitionedValue([NeverRepairCost(model)]))

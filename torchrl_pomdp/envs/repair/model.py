@@ -59,8 +59,7 @@ class RepairModel(Robots):
     the levels that the robots see, robot 0 first.
 
     A robot may not leave the graph; it may repair a location known to be at level 0 only where no move is possible. States
-    with P(any damage) <= ``terminal_probability`` are terminal if level 0 is absorbing: all is over, and what level 0 costs, if
-    anything, is paid until then only.
+    with P(any damage) <= ``terminal_probability`` are terminal if level 0 is absorbing and costs nothing everywhere.
 
     A repair may fail: with probability :math:`1-\rho` the location takes a step of its chain as if nobody had been there. The
     robot sees the level and with it whether the repair has worked. Robots that repair one location together make one attempt.
@@ -79,6 +78,9 @@ class RepairModel(Robots):
         partition: partition whose index becomes a feature.
         dtype: float32 or float64.
         device: where the model computes.
+
+    Attributes:
+        ends: whether there are terminal states: level 0 is absorbing and costs nothing at every location.
 
     Raises:
         TypeError: if an argument is of the wrong kind; the message names it.
@@ -132,7 +134,7 @@ class RepairModel(Robots):
             )
         self.noise_dim = self.num_robots
         self.terminal_probability = check_number("terminal_probability", terminal_probability, "[0, 1)")
-        self.level_zero_absorbing = bool((chain[..., 0, 0] == 1).all())
+        self.ends = bool((chain[..., 0, 0] == 1).all() and (costs[..., 0] == 0).all())
         self._normalise = drifts(chain, dtype)
         self._register_tables(chain.to(dtype), costs, device)
         if partition is not None:
@@ -252,8 +254,8 @@ class RepairModel(Robots):
         return self._stage_cost(self._planes(y)).view(y.batch_size)
 
     def is_terminal(self, y: TensorDictBase) -> Tensor:
-        """Bool ``[*B]``: P(any damage) <= ``terminal_probability``; never where level 0 is not absorbing."""
-        if not self.level_zero_absorbing:
+        """Bool ``[*B]``: P(any damage) <= ``terminal_probability``; never unless the model :attr:`ends`."""
+        if not self.ends:
             return torch.zeros(y.batch_size, dtype=torch.bool, device=self.device)
         intact = multiply_first(self._planes(y)[:, 0].clone())
         return (1.0 - intact <= self.terminal_probability).view(y.batch_size)
@@ -267,11 +269,7 @@ class RepairModel(Robots):
                 too many for tables.
         """
         self.check_control_shape(y, u)
-        if self.num_robots > 1 and self.num_observations > MAX_ENUMERATED:
-            raise ValueError(
-                f"num_observations must be at most {MAX_ENUMERATED} for their probabilities, got {self.num_levels}^"
-                f"{self.num_robots} = {self.num_observations}: draw them by advance(), in rollout with leaves='control'"
-            )
+        self.check_observations_enumerable()
         location, repaired = self._move(y, u)
         columns = self._columns(self._planes(y), location, repaired)
         every = digits(torch.arange(self.num_observations, device=self.device), self.num_levels, self.num_robots)
@@ -285,6 +283,14 @@ class RepairModel(Robots):
                 factor = torch.where(together, same, factor)
             joint = joint * factor
         return joint.movedim(0, -1).reshape(*y.batch_size, self.num_observations)
+
+    def check_observations_enumerable(self) -> None:
+        """Raise ``ValueError`` where robots have more joint observations, 4096, than can be gone through one by one."""
+        if self.num_robots > 1 and self.num_observations > MAX_ENUMERATED:
+            raise ValueError(
+                f"num_observations must be at most {MAX_ENUMERATED} for their probabilities, got {self.num_levels}^"
+                f"{self.num_robots} = {self.num_observations}: draw them by advance(), in rollout with leaves='control'"
+            )
 
     def estimator(self, y: TensorDictBase, u: Tensor, z: Tensor) -> TensorDictBase:
         """F(y, u, z): degrade, then set the levels observed where the robots now stand (0 after a repair).

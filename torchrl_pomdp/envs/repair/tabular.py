@@ -63,11 +63,7 @@ def tabular_model(model: RepairModel, *, start_observed: bool = True) -> Tabular
     controls = digits(torch.arange(model.num_controls), model.num_robot_controls, model.num_robots)
     looked = digits(torch.arange(flags), 2, model.num_robots) == 0
     paid = model.costs.cpu().expand(model.num_locations, -1)[torch.arange(model.num_locations), levels]
-    total = paid.sum(-1)
-    if model.level_zero_absorbing:
-        # All is over once nothing is damaged, even if level 0 costs something until then.
-        total[(levels == 0).all(-1)] = 0.0
-    cost = total.repeat(flags * len(places)).expand(model.num_controls, -1)
+    cost = paid.sum(-1).repeat(flags * len(places)).expand(model.num_controls, -1)
     return TabularModel(
         _transition(model, controls, places, flags),
         _observation(model, places, levels, flags),

@@ -25,7 +25,7 @@ class RepairWorld(World):
     """The true levels of a :class:`RepairModel`.
 
     Entries: ``"level"`` int64 ``[*B, L]`` and ``"location"`` int64 ``[*B, R]``, where the robots stand. Every control that
-    keeps the robots on the graph can be carried out. All levels at 0 are terminal if level 0 is absorbing.
+    keeps the robots on the graph can be carried out. All levels at 0 are terminal if the model :attr:`ends`.
 
     Args:
         model: the repair model.
@@ -67,9 +67,9 @@ class RepairWorld(World):
         return model.action_mask(TensorDict({"belief": unknown, "location": location}, batch_size=hidden.batch_size))
 
     def is_terminal(self, hidden: TensorDictBase) -> Tensor:
-        """Bool ``[*B]``: nothing is damaged; never where level 0 is not absorbing."""
+        """Bool ``[*B]``: nothing is damaged; never unless the model :attr:`ends`."""
         intact = (hidden.get("level") == 0).all(-1)
-        return intact if self.model.level_zero_absorbing else torch.zeros_like(intact)
+        return intact if self.model.ends else torch.zeros_like(intact)
 
     def draw(self, y: TensorDictBase, noise: Tensor) -> TensorDictBase:
         """A level for each location by its marginal; see :meth:`World.draw`."""

@@ -92,9 +92,9 @@ class UrgencyRepair(TensorDictModuleBase):
     r"""Go where damage costs most for the way there, and repair: the location that maximises :math:`(b\cdot c-c_0)/(d+1)^3`.
 
     :math:`b\cdot c-c_0` is what a location is expected to cost per stage more than if it were intact, d the number of moves
-    to it, both as exact as numbers can be and then rounded to the model's type, so that ties are ties. They go to the location,
-    then to the control, with the lower index. Robots choose one after the other, each among the locations that no earlier
-    robot has chosen. A robot for which no costly location is left takes its first move.
+    to it, computed in double precision and rounded to the model's, so that in single precision ties are ties. They go to the
+    location, then to the control, with the lower index. Robots choose one after the other, each among the locations that no
+    earlier robot has chosen. A robot for which no costly location is left takes its first move.
 
     Args:
         model: the repair model.
@@ -141,8 +141,7 @@ class UrgencyRepair(TensorDictModuleBase):
         from torchrl_pomdp.modules.repair.scalar import engine, twins
 
         costs = self.model.costs.double()
-        intact = costs[..., 0].expand(self.model.num_locations).numpy().copy()
-        data = self.remoteness.numpy().T.copy(), intact, float((costs - costs[..., :1]).max())
+        data = self.remoteness.numpy().T.copy(), float((costs - costs[..., :1]).max())
         return engine.repair_engine(twins.urgency, data, self.model, model, limits, numbers=self.model.num_robots)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -195,6 +195,8 @@ class RepairEngine(ScalarEngine):
         controls: NDArray[np.int64] | None = None,
     ) -> tuple[NDArray[np.float64], int]:
         """See :class:`ScalarEngine`."""
+        if allocation.observations:
+            self.model.check_observations_enumerable()
         self._bring_up_to_date()
         belief, location = self._checked(y)
         beliefs = belief.astype(np.float64)

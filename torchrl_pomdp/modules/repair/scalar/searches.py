@@ -22,6 +22,7 @@ from torchrl_pomdp.modules.repair.scalar.events import (
 )
 from torchrl_pomdp.modules.repair.scalar.trajectories import FINE, NEVER, Work, begin, continued, set_initial
 from torchrl_pomdp.modules.repair.scalar.view import View, expected_cost, jointly_legal, legal, split
+from torchrl_pomdp.modules.scenarios import BITS
 from torchrl_pomdp.scalar.compiling import inner
 from torchrl_pomdp.scalar.models import ScalarModel
 from torchrl_pomdp.scalar.noise import scenario_noise, variable_bit
@@ -114,7 +115,7 @@ def _over(data, state):
     tables, limits = data
     if state.stage[0] >= limits.max_steps:
         return True
-    return tables.absorbing and terminal(_view(tables, state, np.uint64(0)), 0)[0]
+    return tables.ends and terminal(_view(tables, state, np.uint64(0)), 0)[0]
 
 
 def _move(data, state, u):
@@ -165,7 +166,9 @@ def _preferred(data, policy, state):
 def _arrival_cost(view, noise, place, n):
     """The least that a location costs, undiscounted, at the stage ``n`` from now when a robot can first see it."""
     tables, levels = view.tables, view.start.shape[1]
-    if (noise.seen & variable_bit(place)) == 0:
+    # Else another location shares its bit, and it may be drawn as if it had been seen.
+    alone = place < BITS and place + BITS >= len(view.level)
+    if alone and (noise.seen & variable_bit(place)) == 0:
         # Seen later, it is found in no lower a level; not seen now, it costs what is expected.
         number = scenario_noise(noise.key, noise.group, noise.member, noise.of, True, place, 0)
         lowest = level_at(view, place, view.stage + n, number)
@@ -198,16 +201,11 @@ def _relaxed(data, state, noise):
         for robot in range(len(state.origin)):
             away = min(away, tables.distances[view.location[robot], place])
         # No robot has been there until then, so that it costs what is expected now; no attempt to repair works earlier.
-        last, kind = now + max(away, 1), tables.kind[place]
+        last = now + max(away, 1)
         total += interval_cost(view, place, last) - interval_cost(view, place, now)
         arrives = away > 0 and last < limits.max_steps
         if arrives:
             total += tables.discounts[last] * _arrival_cost(view, noise, place, away)
-        if tables.steady and not tables.free:
-            # Once nothing is damaged all is over: only what damage costs more is sure to be paid.
-            total -= tables.interval_costs[kind, last, 0] - tables.interval_costs[kind, now, 0]
-            if arrives:
-                total -= tables.discounts[last] * tables.stage_costs[kind, 0, 0]
     # All is over once damage is improbable enough, wherever it is: what it would have cost until a robot came is not paid.
     return max(total / tables.discounts[now] - tables.forgiven, 0.0)
 

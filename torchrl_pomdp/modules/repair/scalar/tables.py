@@ -52,21 +52,22 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
     chain = np.broadcast_to(model.chain.double().numpy(), (size, levels, levels))[first]
     costs, prices = by_location(model.costs, model)[first], _prices(model)
     discounts = np.power(model.discount, np.arange(stages), dtype=np.float64)
-    powers, stage_costs, interval_costs = _evolution(torch.from_numpy(chain), torch.from_numpy(costs), discounts)
+    powers = chain_powers(torch.from_numpy(chain), stages - 1).movedim(0, 1)
+    stage_costs, extra_costs = _expected(powers, costs), _expected(powers, costs - costs[:, :1])
     damage = np.zeros_like(stage_costs)
     for k in range(levels):
         # Summed as the loop sums what it does not read here.
-        damage += powers[..., k] * prices[first, None, None, k]
+        damage += powers[..., k].numpy() * prices[first, None, None, k]
     distances = model.graph.distances.numpy()
-    absorbing = model.level_zero_absorbing
-    steady = absorbing and bool((chain[:, 1:, 0] == 0).all())
+    steady = bool((chain[:, 0, 0] == 1).all() and (chain[:, 1:, 0] == 0).all())
     own = model.partition if isinstance(model.partition, RepairPartition) else None
     return Tables(
         kind=kind,
-        powers=powers,
-        cumulative=np.cumsum(powers, -1),
+        powers=np.ascontiguousarray(powers.numpy()),
+        cumulative=np.cumsum(powers.numpy(), -1),
         stage_costs=stage_costs,
-        interval_costs=interval_costs,
+        extra_costs=extra_costs,
+        interval_costs=_interval_costs(stage_costs, discounts),
         discounts=discounts,
         destinations=model.destinations.numpy(),
         order=np.argsort(distances * size + np.arange(size), 1),
@@ -78,13 +79,13 @@ def make_tables(model: RepairModel, stages: int) -> Tables:
         prices=prices,
         damage=damage,
         works=model.repair_probability,
-        absorbing=absorbing,
+        ends=model.ends,
         steady=steady,
         free=steady and bool((costs[:, 0] == 0.0).all()),
         upward=bool((np.tril(chain, -1) == 0).all() and (costs[:, 0] >= 0.0).all() and (np.diff(costs) >= 0.0).all()),
         least_cost=float(costs.min()),
         terminal_probability=model.terminal_probability,
-        forgiven=_forgiven(model, costs) if absorbing else 0.0,
+        forgiven=_forgiven(model, costs) if model.ends else 0.0,
         damage_threshold=0.0 if own is None else own.damage_threshold,
         low=0.0 if own is None else own.density_bounds[0],
         high=0.0 if own is None else own.density_bounds[1],
@@ -97,23 +98,19 @@ def _forgiven(model: RepairModel, costs: NDArray[np.float64]) -> float:
     Probabilities of damage :math:`p_i` with :math:`1-\prod(1-p_i)\le\epsilon` have a sum of at most
     :math:`-\ln(1-\epsilon)`.
     """
-    return -math.log1p(-model.terminal_probability) * float((costs - costs[:, :1]).max()) / (1.0 - model.discount)
+    return -math.log1p(-model.terminal_probability) * float(costs.max()) / (1.0 - model.discount)
 
 
-def _evolution(
-    chain: Tensor, costs: Tensor, discounts: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Powers ``[J, n, K, K]``, costs of a stage ``[J, n, K]`` and of all stages before it ``[J, n, K]``, by kind of locations.
+def _expected(powers: Tensor, costs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Expected costs ``[J, n, K]`` n stages after each level, by powers ``[J, n, K, K]`` and costs ``[J, K]`` of the kinds."""
+    weighted = powers * torch.from_numpy(costs)[:, None, None]
+    return np.ascontiguousarray(sum_first(weighted.movedim(-1, 0)).numpy())
 
-    Args:
-        chain: the kinds' chains, ``[J, K, K]``.
-        costs: their costs, ``[J, K]``.
-        discounts: of the stages, ``[n]``.
-    """
-    powers = chain_powers(chain, len(discounts) - 1).movedim(0, 1)
-    stage_costs = np.ascontiguousarray(sum_first((powers * costs[:, None, None]).movedim(-1, 0)).numpy())
+
+def _interval_costs(stage_costs: NDArray[np.float64], discounts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Discounted costs ``[J, n, K]`` of the n stages after each level, by those of a stage and discounts ``[n]``."""
     interval_costs = np.zeros_like(stage_costs)
     # What overflows is refused where it is a result.
     with np.errstate(over="ignore"):
         interval_costs[:, 1:] = np.cumsum(discounts[:-1, None] * stage_costs[:, :-1], 1)
-    return np.ascontiguousarray(powers.numpy()), stage_costs, interval_costs
+    return interval_costs

@@ -136,7 +136,7 @@ def _closed_cost(view, limits):
 @inner
 def _ends(view, limits, after, age, own_part, witness):
     """Whether a trajectory goes on, and which part it has started in and what :func:`terminal` remembers."""
-    if view.tables.absorbing:
+    if view.tables.ends:
         over, witness = terminal(view, witness)
         if over:
             return _TERMINAL, own_part, witness

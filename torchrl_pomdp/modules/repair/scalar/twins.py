@@ -6,7 +6,7 @@ import numpy as np
 
 from torchrl_pomdp.modules.repair.scalar.view import (
     View,
-    expected_cost,
+    extra_cost,
     intact,
     jointly_legal,
     legal,
@@ -56,9 +56,9 @@ def greedy(data, view, controls):
 def urgency(data, view, controls):
     """The location with the largest extra cost over a power of the distance.
 
-    ``data`` holds these powers, the cost of each location that is intact, and the largest extra cost.
+    ``data`` holds these powers and the largest extra cost.
     """
-    tables, (remoteness, intact_cost, highest) = view.tables, data
+    tables, (remoteness, highest) = view.tables, data
     rounded = view.intact.dtype.type
     targets = view.work
     for robot in range(len(controls)):
@@ -75,7 +75,7 @@ def urgency(data, view, controls):
             taken = False
             for other in range(robot):
                 taken = taken or targets[other] == place
-            urgent = 0.0 if taken else rounded((expected_cost(view, place) - intact_cost[place]) / away)
+            urgent = 0.0 if taken else rounded(extra_cost(view, place) / away)
             if urgent > best or (urgent == best and 0 <= place < chosen):
                 best, chosen = urgent, place
         targets[robot] = chosen

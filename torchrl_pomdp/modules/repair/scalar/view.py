@@ -14,7 +14,19 @@ from numpy.typing import NDArray
 
 from torchrl_pomdp.scalar.compiling import inner, shared
 
-__all__ = ["Tables", "View", "expected_cost", "intact", "jointly_legal", "legal", "legal_at", "part_of", "probability", "split"]
+__all__ = [
+    "Tables",
+    "View",
+    "expected_cost",
+    "extra_cost",
+    "intact",
+    "jointly_legal",
+    "legal",
+    "legal_at",
+    "part_of",
+    "probability",
+    "split",
+]
 
 
 class Tables(NamedTuple):
@@ -25,6 +37,7 @@ class Tables(NamedTuple):
         powers: :math:`P^n`, by kind, ``[J, n, K, K]``.
         cumulative: the same, summed over the levels up to each, ``[J, n, K, K]``.
         stage_costs: :math:`(P^nc)_k`, by kind, ``[J, n, K]``.
+        extra_costs: :math:`(P^n(c-c_0))_k`, by kind, ``[J, n, K]``.
         interval_costs: :math:`C_{nk}`, by kind, ``[J, n, K]``.
         discounts: :math:`\alpha^n`, ``[n]``.
         destinations: location after a robot's control, -1 where the move leaves the graph, ``[L, A]``.
@@ -37,8 +50,8 @@ class Tables(NamedTuple):
         prices: cost of every level, as the partition has them, ``[L, K]``.
         damage: :math:`(P^np)_k` with these costs p, by kind, ``[J, n, K]``.
         works: :math:`\rho`, that an attempt to repair works.
-        absorbing: whether level 0 is everywhere, so that there are terminal states.
-        steady: whether, moreover, no other level leads to level 0 anywhere.
+        ends: whether level 0 is absorbing and costs nothing everywhere, so that there are terminal states.
+        steady: whether level 0 is absorbing, and no other level leads to it, everywhere.
         free: whether, moreover, level 0 costs nothing anywhere.
         upward: whether levels never fall by themselves, higher ones cost no less, and none costs less than nothing.
         least_cost: of a level, anywhere.
@@ -53,6 +66,7 @@ class Tables(NamedTuple):
     powers: NDArray[np.float64]
     cumulative: NDArray[np.float64]
     stage_costs: NDArray[np.float64]
+    extra_costs: NDArray[np.float64]
     interval_costs: NDArray[np.float64]
     discounts: NDArray[np.float64]
     destinations: NDArray[np.int64]
@@ -65,7 +79,7 @@ class Tables(NamedTuple):
     prices: NDArray[np.float64]
     damage: NDArray[np.float64]
     works: float
-    absorbing: bool
+    ends: bool
     steady: bool
     free: bool
     upward: bool
@@ -80,7 +94,7 @@ class Tables(NamedTuple):
 class View(NamedTuple):
     """What a scalar twin sees of a simulated trajectory, see :func:`torchrl_pomdp.scalar.scalar_twin`.
 
-    Ask for beliefs by :func:`intact`, :func:`expected_cost` and :func:`probability`.
+    Ask for beliefs by :func:`intact`, :func:`expected_cost`, :func:`extra_cost` and :func:`probability`.
 
     Attributes:
         stage: stages since the trajectory started.
@@ -118,15 +132,27 @@ def probability(view, place, level):
 
 
 @inner
-def expected_cost(view, place):
-    """Expected cost of a location at this stage."""
+def _expected(view, place, numbers):
+    """The mean of numbers ``[J, n, K]``, which depend on the level at the last look and on the stages since."""
     n, known, kind = view.stage - view.since[place], view.level[place], view.tables.kind[place]
     if known >= 0:
-        return view.tables.stage_costs[kind, n, known]
+        return numbers[kind, n, known]
     total = 0.0
     for k in range(view.start.shape[1]):
-        total += view.start[place, k] * view.tables.stage_costs[kind, n, k]
+        total += view.start[place, k] * numbers[kind, n, k]
     return total
+
+
+@inner
+def expected_cost(view, place):
+    """Expected cost of a location at this stage."""
+    return _expected(view, place, view.tables.stage_costs)
+
+
+@inner
+def extra_cost(view, place):
+    """What a location is expected to cost at this stage more than if it were intact; exactly 0 where no level costs more."""
+    return _expected(view, place, view.tables.extra_costs)
 
 
 @inner
