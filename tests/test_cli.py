@@ -21,6 +21,7 @@ from torchrl_pomdp.evaluation import compare, discounted_costs, estimate
 from torchrl_pomdp.modules import PartitionedValue
 from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.problems import make_problem
+from torchrl_pomdp.report.tables import Result, table
 from torchrl_pomdp.trainers import Checkpoint, PolicyIterationConfig, load_checkpoint, save_checkpoint
 
 TINY = (
@@ -134,7 +135,14 @@ def test_evaluate_by_name_and_online(policy, capsys):
         ("train line3 --out FILE/run", "out must be a folder that can be written"),
         ("train line3 --out FILE", "out must be a folder that can be written"),
         ("train line3 --out /proc/run", "out must be a folder that can be written"),
-        ("evaluate nowhere.pt", "there is no checkpoint nowhere.pt"),
+        (
+            "evaluate nowhere.pt",
+            "policy must be the path of a checkpoint, or with --problem the name of a base policy, got 'nowhere.pt'",
+        ),
+        (
+            "evaluate nobody --problem line3",
+            "policy must be the path of a checkpoint, or one of greedy, urgency, got 'nobody'",
+        ),
         ("evaluate FILE", "is damaged or no"),
         ("evaluate greedy --problem nosuch", "problem must be a preset"),
         ("evaluate greedy --states 0", "states must be"),
@@ -199,7 +207,7 @@ def test_damaged_iterations_are_named(content, tmp_path, capsys):
     best = Checkpoint(problem, PolicyIterationConfig(), "API", 0, problem.base_policies["greedy"], value)
     save_checkpoint(tmp_path / "best.pt", best)
     (tmp_path / "iterations.json").write_text(content)
-    assert main(["compare", "line3", "--checkpoint", str(tmp_path / "best.pt"), "--methods", "urgency"]) == 2
+    assert main(["compare", "line3", "--checkpoint", str(tmp_path / "best.pt"), "--methods", "PPO"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"{tmp_path / 'iterations.json'} is damaged" in line
 
@@ -321,3 +329,9 @@ def test_a_measurement_of_more_states_is_not_overwritten(tmp_path):
     command = cli.Changes(states=100, trajectories=10, out=tmp_path)
     with pytest.raises(ValueError, match="holds another measurement, not of 100 start states"):
         commands.changes(command)
+
+
+def test_a_table_says_where_start_states_are_fewer():
+    cost = torch.tensor([10.0, 20.0, 30.0])
+    lines = table([Result("greedy", compare(cost, cost)), Result("R-NT", compare(cost[:2], cost[:2]))]).splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:]] == ["| greedy", "| R-NT (2 start states)"]

@@ -160,6 +160,9 @@ def _named_policy(command: Evaluate, device: torch.device) -> tuple[Problem, Pol
     given = None if command.problem is None else find_problem(command.problem, device)
     if given is not None and command.policy in given.base_policies:
         return given, given.base_policies[command.policy], command.policy
+    if not Path(command.policy).is_file():
+        names = "with --problem the name of a base policy" if given is None else f"one of {', '.join(given.base_policies)}"
+        raise ValueError(f"policy must be the path of a checkpoint, or {names}, got {command.policy!r}")
     checkpoint = load_checkpoint(command.policy, problem=given, device=device)
     return checkpoint.problem, checkpoint.policy, checkpoint.name
 
@@ -170,6 +173,7 @@ def compare(command: Compare) -> None:
     given = None if command.checkpoint is None else load_checkpoint(command.checkpoint, problem=problem)
     name = f"compare-{problem.name}-{command.seconds:g}s"
     runs, out = check_folder("runs", command.runs), check_folder("out", command.out) / "compare"
+    ppo = command.methods is None or "PPO" in command.methods
     about = {**asdict(command), **{key: str(getattr(command, key)) for key in ("checkpoint", "runs", "out")}}
     about |= {"methods": command.methods and list(command.methods), "policy": given and digest(given.policy)}
     _check_same(out / f"{name}.json", about)
@@ -177,7 +181,7 @@ def compare(command: Compare) -> None:
         problem,
         runs / f"{name}-seed{command.seed}",
         checkpoint=given,
-        ppo_steps=None if command.checkpoint is None or given is None else _ppo_steps(command.checkpoint.parent, given),
+        ppo_steps=None if given is None or not ppo else _ppo_steps(cast(Path, command.checkpoint).parent, given),
         methods=command.methods,
         states=command.states,
         seconds=command.seconds,

@@ -116,7 +116,7 @@ class Controller:
                 ``"location"`` ``[R]``, for a tabular one ``"belief"`` ``[n]``. Batch ``(1,)`` is taken too.
 
         Raises:
-            TypeError: if it is no TensorDict, or an entry has another type.
+            TypeError: if it is no TensorDict, or an entry has another type; floats of another precision are converted.
             ValueError: if it is no single feature state of the model.
         """
         self._state, self._steps = self._single("prior", prior), 0

@@ -69,3 +69,8 @@ def test_entries_have_no_names_of_what_stands_beside_them(name):
 
     with pytest.raises(ValueError, match=f"state_keys must not hold names of what stands beside a state, got {name}"):
         Named(torch.ones(1, 1, 1), torch.ones(1, 1, 1), torch.ones(1, 1), 0.9)
+
+
+def test_start_states_must_be_states_of_the_model():
+    with pytest.raises(ValueError, match=r"entry .belief. of y has shape \(1, 3\), expected \(1, 2\)"):
+        Problem(tiger().model, FixedBelief(torch.tensor([1.0, 0.0, 0.0])))

@@ -34,7 +34,7 @@ class RolloutPolicy(SimulatedQFactors):
         truncation: where simulations are cut, and ``max_steps``: when.
         terminal_cost: :math:`\hat J`, added at the cut.
         seed: seed of the simulations.
-        options: for these and all others see :class:`~torchrl_pomdp.modules.qfactors.SimulatedQFactors`.
+        leaves, chunk_rows, compile: these, and more on the others: :class:`~torchrl_pomdp.modules.qfactors.SimulatedQFactors`.
 
     Raises:
         TypeError: if an argument is of the wrong kind.

@@ -68,8 +68,8 @@ class Problem:
 
     Raises:
         TypeError: if an argument is of the wrong kind.
-        ValueError: if there is not one training generator for each part, or no base policy, or the first symmetry changes
-            start states.
+        ValueError: if there is not one training generator for each part, or no base policy, the first symmetry changes
+            start states, or these are no states of the model.
 
     Examples:
         >>> from torchrl_pomdp.envs import FixedBelief, TabularModel
@@ -100,6 +100,7 @@ class Problem:
         model = check_instance("model", self.model, BeliefModel)
         if model.partition is None:
             model = model.with_partition(SinglePart())
+        model.drawn(self.start, torch.arange(1, device=model.device), "start")
         self._set(model=model)
         self._set(
             training=self._checked_training(),

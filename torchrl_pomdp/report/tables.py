@@ -38,6 +38,8 @@ class Result:
 def table(results: Sequence[Result]) -> str:
     """Markdown table of costs, paired differences and ratios, each with its 95 % interval.
 
+    Costs of fewer start states than those of others, which must not be compared with these, say how many they are.
+
     Raises:
         TypeError: if something is of the wrong kind.
 
@@ -54,11 +56,13 @@ def table(results: Sequence[Result]) -> str:
         "| policy | discounted cost | difference | ratio | 95 % interval of the ratio |",
         "|---|---|---|---|---|",
     ]
-    for result in check_sequence("results", results, Result):
+    most = max((result.comparison.cost.count for result in check_sequence("results", results, Result)), default=0)
+    for result in results:
         c = result.comparison
+        few = f" ({c.cost.count} start states)" if c.cost.count < most else ""
         digits = _decimals(c.difference, _decimals(c.cost))
         lines.append(
-            f"| {result.name} | {interval_text(c.cost)} | {c.difference.mean:+.{digits}f} ± "
+            f"| {result.name}{few} | {interval_text(c.cost)} | {c.difference.mean:+.{digits}f} ± "
             f"{half_width(c.difference):.{digits}f} | "
             f"{' | '.join(ratio_texts(c.ratio))} |"
         )
