@@ -145,3 +145,4 @@ def test_generators(chain, robots, dtype):
         for other, index in [*((piece, torch.arange(10)) for piece in pieces), (generator(keys[order]), order)]:
             assert torch.equal(other["belief"], whole["belief"][index])
             assert torch.equal(other["location"], whole["location"][index])
+        assert generator(keys[:0])["belief"].shape == (0, 7, model.num_levels)
