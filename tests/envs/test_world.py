@@ -16,6 +16,7 @@ from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_pomdp.envs import BeliefEnv, FixedBelief, Mixture, SinglePart, TabularModel, TrackBelief, WorldEnv
+from torchrl_pomdp.envs.gym.simulation import WorldSimulation
 from torchrl_pomdp.envs.repair import CalibratedStart, RepairModel, damage_chain, line
 from torchrl_pomdp.modules.repair import GreedyRepair
 from torchrl_pomdp.noise import uniform
@@ -227,18 +228,32 @@ def test_the_world_alone_ends_with_its_hidden_state():
 
 
 def test_no_cost_is_counted_after_the_end():
-    """Where level 0 costs something, and where damage remains that is too improbable to go on for."""
+    """Where damage remains that is too improbable to go on for."""
     belief = [[1 - 2e-7, 2e-7, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
-    for costs in ((0.0, 1.0, 5.0), (0.5, 1.0, 5.0)):
-        model = small_model(costs)
-        world = WorldEnv(model, start_of(belief), batch_size=(8,), seed=0)
-        env = TransformedEnv(world, TrackBelief(model))
-        td = env.reset()
-        assert td["terminated"].all()
-        world._inside["hidden", "level"][:, 0] = 1
-        after = env.step(env.rand_action(td))["next"]
-        assert (after["reward"] == 0).all()
-        assert after["terminated"].all()
+    model = small_model((0.0, 1.0, 5.0))
+    world = WorldEnv(model, start_of(belief), batch_size=(8,), seed=0)
+    env = TransformedEnv(world, TrackBelief(model))
+    td = env.reset()
+    assert td["terminated"].all()
+    world._inside["hidden", "level"][:, 0] = 1
+    after = env.step(env.rand_action(td))["next"]
+    assert (after["reward"] == 0).all()
+    assert after["terminated"].all()
+
+
+def test_costs_of_intact_locations_are_paid_for_ever_by_every_door():
+    """Beliefs and hidden states pay the same on average, though all may be intact without anyone knowing."""
+    model = small_model((0.5, 1.0, 5.0))
+    start, expected = start_of([[0.5, 0.5, 0.0]] * 4), 4 * 0.75
+    by_belief = BeliefEnv(model, start, batch_size=(8192,), seed=0).rollout(1)["next", "reward"]
+    world = TransformedEnv(WorldEnv(model, start, batch_size=(8192,), seed=0), TrackBelief(model))
+    by_world = world.rollout(1)["next", "reward"]
+    assert float(by_belief.mean()) == pytest.approx(-expected)
+    assert float(by_world.mean()) == pytest.approx(-expected, abs=0.03)
+    hidden, keys = WorldSimulation(model, start), torch.arange(8192)
+    cost, after = hidden.step(hidden.start(keys), torch.full((8192,), 2), keys)
+    assert float(cost.mean()) == pytest.approx(expected, abs=0.03)
+    assert not hidden.over(after).any()
 
 
 def test_finished_rows_stay_as_they_are():

@@ -367,12 +367,14 @@ def test_damage_too_improbable_to_go_on_for_is_not_charged(epsilon, damage):
     assert high == pytest.approx(paid, rel=1e-4)
 
 
-def test_all_is_over_once_nothing_is_damaged_though_level_0_costs():
+def test_nothing_is_over_where_level_0_costs():
+    """20 a stage for ever, and 1 in the first one."""
     model = RepairModel(line(2), damage_chain((0.0,)), (10.0, 11.0), 0.9)
     y = TensorDict({"belief": torch.tensor([[0.0, 1.0], [1.0, 0.0]]), "location": torch.tensor([0])}, [])
     found = solve(tabular_model(model), joint_belief(model, y))
-    assert list(found.interval) == pytest.approx([21.0, 21.0], rel=0.005)
-    assert DESPOT(model, GreedyRepair(model), simulations=20)(y[None])["q_factors"].min() == 21.0
+    assert list(found.interval) == pytest.approx([201.0, 201.0], rel=0.005)
+    low, high = DESPOT(model, GreedyRepair(model), simulations=20, max_steps=300).bounds(y[None])
+    assert [float(low), float(high)] == pytest.approx([201.0, 201.0], rel=1e-5)
 
 
 @pytest.mark.parametrize("size", [63, 64])

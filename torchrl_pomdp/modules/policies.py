@@ -51,14 +51,16 @@ def check_policy(name: str, policy: Any, model: BeliefModel) -> Any:
 
     Raises:
         TypeError: if it cannot be called.
-        ValueError: if it has local modules for other parts than the model's.
+        ValueError: if it has local modules for other parts than the model's, which may have none.
     """
     check_callable(name, policy)
-    num_parts = getattr(policy, "num_parts", None)
-    parts = 0 if model.partition is None else model.partition.num_parts
-    if num_parts is not None and num_parts != parts:
-        whose = f"each of the model's {parts} parts" if parts else "parts of a partition, which the model does not have"
-        raise ValueError(f"{name} must have local modules for {whose}, got {num_parts}")
+    num_parts, partition = getattr(policy, "num_parts", None), model.partition
+    if num_parts is not None and partition is None:
+        raise ValueError(f"{name} must have no local modules, as the model has no partition, got {num_parts}")
+    if partition is not None and num_parts not in (None, partition.num_parts):
+        raise ValueError(
+            f"{name} must have a local module for each of the model's {partition.num_parts} parts, got {num_parts}"
+        )
     return policy
 
 

@@ -830,7 +830,7 @@ def test_more_observations_than_can_be_gone_through_are_refused(compiled):
 def test_local_modules_need_a_partition():
     own = make_problem("line3").model
     model = RepairModel(own.graph, own.chain.double(), own.costs, own.discount)
-    rule = r"must have local modules for parts of a partition, which the model does not have, got 1"
+    rule = "must have no local modules, as the model has no partition, got 1"
     with pytest.raises(ValueError, match="base_policy " + rule):
         RolloutPolicy(model, PartitionedPolicy([GreedyRepair(model)]))
     with pytest.raises(ValueError, match="terminal_cost " + rule):

@@ -203,9 +203,12 @@ def _relaxed(data, state, noise):
         # No robot has been there until then, so that it costs what is expected now; no attempt to repair works earlier.
         last = now + max(away, 1)
         total += interval_cost(view, place, last) - interval_cost(view, place, now)
-        arrives = away > 0 and last < limits.max_steps
-        if arrives:
+        if away > 0 and last < limits.max_steps:
             total += tables.discounts[last] * _arrival_cost(view, noise, place, away)
+            last += 1
+        # From then on it costs at least what it costs intact, for as long as simulations go on.
+        intact_cost = tables.stage_costs[tables.kind[place], 0, 0]
+        total += intact_cost * (tables.discounts[last] - tables.discounts[limits.max_steps]) / (1.0 - tables.discounts[1])
     # All is over once damage is improbable enough, wherever it is: what it would have cost until a robot came is not paid.
     return max(total / tables.discounts[now] - tables.forgiven, 0.0)
 
