@@ -48,8 +48,7 @@ class BeliefEnv(EnvBase):
     Raises:
         TypeError: if an argument is of the wrong kind.
         ValueError: if a size is not positive or the seed is negative; by ``step`` if a control is illegal or a state is none
-            of the model's, by ``reset`` if a given or generated state is none, or
-            states are given with flags ``"_reset"``.
+            of the model's, by ``reset`` if a given or generated state is none, or states are given with flags ``"_reset"``.
 
     Examples:
         >>> from torchrl_pomdp.problems import make_problem

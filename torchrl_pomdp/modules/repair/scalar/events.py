@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_pomdp.modules.repair.scalar.view import probability
+from torchrl_pomdp.modules.repair.scalar.view import expected, probability
 from torchrl_pomdp.scalar.compiling import inner, shared
 from torchrl_pomdp.scalar.noise import scenario_noise, variable_bit
 
@@ -61,14 +61,7 @@ def level_at(view, place, stage, noise):
 @inner
 def interval_cost(view, place, stage):
     """Discounted cost of a location from when it was last seen until ``stage``."""
-    tables, since, known = view.tables, view.since[place], view.level[place]
-    n, kind = stage - since, tables.kind[place]
-    if known >= 0:
-        return tables.discounts[since] * tables.interval_costs[kind, n, known]
-    total = 0.0
-    for k in range(view.start.shape[1]):
-        total += view.start[place, k] * tables.interval_costs[kind, n, k]
-    return total
+    return view.tables.discounts[view.since[place]] * expected(view, place, stage, view.tables.interval_costs)
 
 
 @inner

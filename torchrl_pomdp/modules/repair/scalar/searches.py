@@ -21,7 +21,7 @@ from torchrl_pomdp.modules.repair.scalar.events import (
     terminal,
 )
 from torchrl_pomdp.modules.repair.scalar.trajectories import FINE, NEVER, Work, begin, continued, set_initial
-from torchrl_pomdp.modules.repair.scalar.view import View, expected_cost, jointly_legal, legal, split
+from torchrl_pomdp.modules.repair.scalar.view import View, expected, expected_cost, jointly_legal, legal, split
 from torchrl_pomdp.modules.scenarios import BITS
 from torchrl_pomdp.scalar.compiling import inner
 from torchrl_pomdp.scalar.models import ScalarModel
@@ -176,14 +176,8 @@ def _arrival_cost(view, noise, place, n):
         lowest = max(view.level[place], 0)
         while view.level[place] < 0 and lowest < levels - 1 and view.start[place, lowest] == 0.0:
             lowest += 1
-    known, since, expected = view.level[place], view.stage + n - view.since[place], 0.0
-    kind = tables.kind[place]
-    if known >= 0:
-        expected = tables.stage_costs[kind, since, known]
-    else:
-        for k in range(levels):
-            expected += view.start[place, k] * tables.stage_costs[kind, since, k]
-    return min(expected, tables.stage_costs[kind, 0, lowest])
+    cost = expected(view, place, view.stage + n, tables.stage_costs)
+    return min(cost, tables.stage_costs[tables.kind[place], 0, lowest])
 
 
 def _relaxed(data, state, noise):

@@ -17,6 +17,7 @@ from torchrl_pomdp.scalar.compiling import inner, shared
 __all__ = [
     "Tables",
     "View",
+    "expected",
     "expected_cost",
     "extra_cost",
     "intact",
@@ -132,9 +133,9 @@ def probability(view, place, level):
 
 
 @inner
-def _expected(view, place, numbers):
-    """The mean of numbers ``[J, n, K]``, which depend on the level at the last look and on the stages since."""
-    n, known, kind = view.stage - view.since[place], view.level[place], view.tables.kind[place]
+def expected(view, place, stage, numbers):
+    """The mean, at a stage, of numbers ``[J, n, K]`` that depend on the level at the last look and on the stages since."""
+    n, known, kind = stage - view.since[place], view.level[place], view.tables.kind[place]
     if known >= 0:
         return numbers[kind, n, known]
     total = 0.0
@@ -146,13 +147,13 @@ def _expected(view, place, numbers):
 @inner
 def expected_cost(view, place):
     """Expected cost of a location at this stage."""
-    return _expected(view, place, view.tables.stage_costs)
+    return expected(view, place, view.stage, view.tables.stage_costs)
 
 
 @inner
 def extra_cost(view, place):
     """What a location is expected to cost at this stage more than if it were intact; exactly 0 where no level costs more."""
-    return _expected(view, place, view.tables.extra_costs)
+    return expected(view, place, view.stage, view.tables.extra_costs)
 
 
 @inner
