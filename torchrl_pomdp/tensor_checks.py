@@ -19,6 +19,7 @@ __all__ = [
     "check_dtype",
     "check_entries",
     "check_keys",
+    "check_representable",
     "check_tensor",
     "device_of",
     "place",
@@ -159,6 +160,22 @@ def check_keys(name: str, value: Any) -> Tensor:
     if not isinstance(value, torch.Tensor) or value.dtype != torch.int64:
         given = value.dtype if isinstance(value, torch.Tensor) else shown(value)
         raise TypeError(f"{name} must be an int64 tensor, got {given}")
+    return value
+
+
+def check_representable(name: str, value: float, dtype: torch.dtype) -> float:
+    """A number of Python's that stays finite in the type of beliefs and costs.
+
+    Raises:
+        ValueError: if it is not finite there.
+
+    Examples:
+        >>> check_representable("cost", 1e39, torch.float32)
+        Traceback (most recent call last):
+        ValueError: cost must be finite in torch.float32, got 1e+39
+    """
+    if not abs(value) <= torch.finfo(dtype).max:
+        raise ValueError(f"{name} must be finite in {dtype}, got {value}")
     return value
 
 

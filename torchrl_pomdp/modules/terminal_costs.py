@@ -19,7 +19,7 @@ from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.threads import blocks, map_threads
 from torchrl_pomdp.modules.truncation import Truncation
 from torchrl_pomdp.noise import fold
-from torchrl_pomdp.tensor_checks import device_of
+from torchrl_pomdp.tensor_checks import check_representable, device_of
 
 __all__ = ["ClosedFormCost", "ConstantCost", "PolicyCost", "ZeroCost"]
 
@@ -64,9 +64,7 @@ class ConstantCost(ClosedFormCost):
         super().__init__()
         self.dtype = check_instance("model", model, BeliefModel).dtype
         self.in_keys = list(model.state_keys[:1])
-        self._cost = check_number("cost", cost, "(-inf, inf)")
-        if abs(self._cost) > torch.finfo(self.dtype).max:
-            raise ValueError(f"cost must be finite in {self.dtype}, got {self._cost}")
+        self._cost = check_representable("cost", check_number("cost", cost, "(-inf, inf)"), self.dtype)
 
     @property
     def cost(self) -> float:

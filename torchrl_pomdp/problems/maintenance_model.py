@@ -23,7 +23,7 @@ from torchrl_pomdp.envs.digits import digits
 from torchrl_pomdp.envs.partition import Partition
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.envs.world import World
-from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype, check_tensor
+from torchrl_pomdp.tensor_checks import check_device, check_distributions, check_dtype, check_representable, check_tensor
 
 __all__ = ["INSPECT", "NOTHING", "REPLACE", "Component", "MaintenanceModel"]
 
@@ -139,9 +139,8 @@ class MaintenanceModel(BeliefModel):
             sizes = f"3^{self.num_components} controls and {self.num_levels}^{self.num_components} observations"
             raise ValueError(f"components must have at most {_MOST} joint controls, and as many observations, got {sizes}")
         prices = torch.tensor([[0.0, part.replacement_cost, part.inspection_cost] for part in components], dtype=torch.float64)
-        self.max_cost = float(prices.amax(-1).sum()) + self.penalty
-        if not self.max_cost <= torch.finfo(dtype).max:
-            raise ValueError(f"penalty and costs of the components must be finite in {dtype}, got {self.max_cost} in all")
+        total = float(prices.amax(-1).sum()) + self.penalty
+        self.max_cost = check_representable("penalty and costs of the components, in all,", total, dtype)
         inspection = torch.stack([part.inspection(self.num_levels) for part in components])
         controls = digits(torch.arange(self.num_controls), 3, self.num_components)
         tables = {

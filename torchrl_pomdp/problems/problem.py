@@ -21,6 +21,7 @@ from torchrl_pomdp.modules.base_policies import Myopic, as_policy
 from torchrl_pomdp.modules.encoders import Encoder, FlatEncoder
 from torchrl_pomdp.modules.policies import Policy
 from torchrl_pomdp.modules.terminal_costs import ClosedFormCost, ConstantCost, ZeroCost
+from torchrl_pomdp.tensor_checks import check_representable
 
 __all__ = ["Problem", "Symmetry"]
 
@@ -113,8 +114,7 @@ class Problem:
         if self.pessimistic_cost is None:
             bound = model.max_cost if model.max_cost is not None else _largest_cost(model, self.start)
             for_ever = (bound or 1.0) / (1.0 - model.discount)
-            if not for_ever <= torch.finfo(model.dtype).max:
-                raise ValueError(f"cost of the model, paid for ever, must be finite in {model.dtype}, got {for_ever}")
+            check_representable("cost of the model, paid for ever,", for_ever, model.dtype)
             self._set(pessimistic_cost=ConstantCost(model, for_ever))
         check_instance("pessimistic_cost", self.pessimistic_cost, ClosedFormCost)
         _check_positive(self.pessimistic_cost, self.start, model.device)
