@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
@@ -283,6 +284,10 @@ FILES = {
     "tensor_checks.check_distributions": lambda _: a_check(
         tensor_checks.check_distributions, CHAIN,
         [value for value in probabilities(CHAIN) if value.label in ("all zero", "all one", "halved", "negative", "with NaN")],
+    ),
+    # Of a real number, which is checked before.
+    "tensor_checks.check_representable": lambda _: a_check(
+        tensor_checks.check_representable, 7.0, values(1e39, -1e39, math.inf, math.nan), dtype=torch.float32
     ),
     "tensor_checks.check_entries": lambda _: a_check(
         tensor_checks.check_entries, state(), [

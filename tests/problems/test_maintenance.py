@@ -252,6 +252,8 @@ def test_agents_controls_are_those_of_one_agent():
 
 def test_costs_that_are_too_large_for_the_type_are_refused():
     bulb = Component(3.0, 1.0, 0.0, 1.0, [[0.9, 0.1], [0.0, 1.0]])
-    with pytest.raises(ValueError, match=r"penalty and costs of the components, in all, must be finite in torch.float32, got 1e\+39"):
+    with pytest.raises(
+        ValueError, match=r"penalty and costs of the components, in all, must be finite in torch.float32, got 1e\+39"
+    ):
         MaintenanceModel([bulb, bulb], 1, penalty=1e39, stages=10)
     assert MaintenanceModel([bulb, bulb], 1, penalty=1e39, stages=10, dtype=torch.float64).penalty == 1e39
