@@ -207,6 +207,34 @@ def in_another_process(script, *args):
     return subprocess.run([sys.executable, "-c", script, *args], capture_output=True, text=True, check=True).stdout.split()
 
 
+def test_what_a_document_defines_is_read_from_disk_again(tmp_path):
+    """It is executed under a name that is no module's, which numba would import."""
+    block = """
+from torchrl_pomdp.scalar.compiling import inner
+@inner
+def half(x):
+    if x < 0:
+        raise ValueError("negative")
+    return x / 2
+"""
+    script = """
+import sys
+from torchrl_pomdp.scalar.compiling import entry, outer
+shared = {"__name__": "page"}
+exec(compile(sys.argv[1], "page.md", "exec"), shared)
+half = shared["half"]
+@outer
+def loop(n):
+    return half(n) + half(n)
+print(entry(loop, 3)(4), sum(loop.stats.cache_hits.values()))
+"""
+    (tmp_path / "document.py").write_text(script)
+    command = [sys.executable, str(tmp_path / "document.py"), block]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    found = [subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout for _ in range(2)]
+    assert found == ["4.0 0\n", "4.0 1\n"]
+
+
 @scalar_twin
 def stay(data, view, controls):
     controls[0] = 7

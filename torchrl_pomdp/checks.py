@@ -185,7 +185,7 @@ def check_text(name: str, value: Any) -> str:
 
 
 def check_label(name: str, value: Any) -> str:
-    """A text that files and folders are called by: at most 100 characters, not beginning with a dot, no slashes.
+    """A text that files and folders are called by: at most 100 bytes of UTF-8, not beginning with a dot, no slashes.
 
     Raises:
         TypeError: if it is no text.
@@ -196,10 +196,10 @@ def check_label(name: str, value: Any) -> str:
         '5 x 4 grid'
         >>> check_label("name", "../x")
         Traceback (most recent call last):
-        ValueError: name must have at most 100 characters, no slash, and no dot in front, ...
+        ValueError: name must have at most 100 bytes in UTF-8, no slash, and no dot in front, ...
     """
-    if len(check_text(name, value)) > 100 or value.startswith(".") or set(value) & set("/\\"):
-        rule = "at most 100 characters, no slash, and no dot in front, since files are called by it"
+    if len(check_text(name, value).encode()) > 100 or value.startswith(".") or set(value) & set("/\\"):
+        rule = "at most 100 bytes in UTF-8, no slash, and no dot in front, since files are called by it"
         raise ValueError(f"{name} must have {rule}, got {shown(value)}")
     return value
 

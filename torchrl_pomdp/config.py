@@ -76,7 +76,7 @@ class PolicyIterationConfig:
     """Largest number of states of a part in the memory."""
 
     symmetries: bool = True
-    """Whether mirror images of labelled states are labelled states too; not of several robots with ``multiagent``."""
+    """Whether mirror images of labelled states are labelled states too; of robots in turn, those that keep their order."""
 
     encoder: Literal["own", "flat"] = "own"
     """Network input: the problem's own, for repair beliefs at offsets from the robot; or the paper's flattened beliefs."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_leaf_nontensor
 from torch import Tensor, nn
 
 __all__ = ["digest", "identity"]
@@ -187,7 +187,8 @@ class _Graph:
         if isinstance(value, Tensor):
             return _tensor(value)
         if isinstance(value, TensorDictBase):
-            leaves = {str(key): value.get(key) for key in value.keys(include_nested=True, leaves_only=True)}
+            keys = value.keys(include_nested=True, leaves_only=True, is_leaf=is_leaf_nontensor)
+            leaves = {str(key): value.get(key) for key in keys}
             return _content("tensordict", str(tuple(value.batch_size)), groups=leaves.items())
         if type(value) in (dict, types.MappingProxyType):
             # The order of layers, or of the parts that are sampled from, decides what they give.
@@ -224,7 +225,7 @@ class _Graph:
             own = None if isinstance(value.__self__, types.ModuleType) else value.__self__
             return _content("builtin", _name(value), holds=[own])
         if isinstance(value, (functools.partial, functools.partialmethod)):
-            return _content("partial", holds=[value.func, value.args, value.keywords])
+            return _content("partial", holds=[value.func, value.args, value.keywords, vars(value)])
         if isinstance(getattr(value, "py_func", None), types.FunctionType):
             return _content("compiled", holds=[value.py_func, getattr(value, "targetoptions", None)])
         return _content("object", holds=[type(value), *_state(value)])

@@ -165,7 +165,7 @@ BROKEN = [
     ('pomdp = "."', ", line 1", "pomdp: must be a file that can be read, got '.'.*must be a file"),
     ('pomdp = "a\\u0000b"', ", line 1", "pomdp: must be a file that can be read"),
     ('name = "../../x"' + REPAIR, ", line 1", "name: name must have .* no slash"),
-    ("name = '" + "x" * 300 + "'" + REPAIR, ", line 1", "name: name must have at most 100 characters"),
+    ("name = '" + "x" * 300 + "'" + REPAIR, ", line 1", "name: name must have at most 100 bytes in UTF-8"),
     (changed(REPAIR, "20]", "1" + "0" * 400 + "]"), ", line 5", "repair.costs: must be an array of numbers"),
     (changed(REPAIR, "0.95", "1" + "0" * 5000), "", "Exceeds the limit"),
     ("pomdp = 3", ", line 1", "pomdp: must be the text of a file .POMDP, got 3"),

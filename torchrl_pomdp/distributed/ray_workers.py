@@ -16,6 +16,7 @@ from torchrl.record.loggers import Logger
 
 from torchrl_pomdp.checks import check_integer, check_text
 from torchrl_pomdp.distributed.part_actor import PartActor
+from torchrl_pomdp.logs import close_log
 from torchrl_pomdp.workers import PartTraining, Task, Training, WorkerError, Workers
 
 __all__ = ["RayWorkers"]
@@ -220,6 +221,7 @@ class RayTraining(Training):
         if self.logger is not None:
             for name, value, step in rows:
                 self.logger.log_scalar(name, value, step=step)
+            close_log(self.logger, self.job.name)
         return trained
 
 

@@ -59,7 +59,8 @@ class Problem:
         pessimistic_cost: a positive cost of every state: the scale of value networks, and what is added where a simulation
             is cut. By default :math:`\max|\hat g|/(1-\alpha)`, with the model's ``max_cost`` or, where it has none, the
             largest stage cost that random play meets.
-        symmetries: renamings under which labels stay labels, the identity first. By default the identity alone.
+        symmetries: renamings under which labels stay labels, the identity first. By default the identity alone. Where agents
+            decide in turn, the others must say by a true attribute ``keeps_order`` that they rename no agents, or are not used.
         encoder: what makes the encoder of the networks from the model. By default
             :class:`~torchrl_pomdp.modules.FlatEncoder`.
         agent_encoder: what makes the encoder of networks that many agents share. By default

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import dis
 import logging
+import sys
 from collections.abc import Callable
 from functools import cache
 from threading import Timer
@@ -83,7 +84,9 @@ def _as_it_is(function: FunctionType) -> FunctionType:
     copy = FunctionType(
         function.__code__, {**function.__globals__}, function.__name__, function.__defaults__, function.__closure__
     )
-    copy.__kwdefaults__, copy.__module__, copy.__doc__ = function.__kwdefaults__, function.__module__, function.__doc__
+    copy.__kwdefaults__, copy.__doc__ = function.__kwdefaults__, function.__doc__
+    # Numba imports the module when it reads compiled code from disk; what ``exec`` defines may name one that is not there.
+    copy.__module__ = function.__module__ if function.__module__ in sys.modules else "__main__"
     copy.__dict__.update(function.__dict__)
     return copy
 

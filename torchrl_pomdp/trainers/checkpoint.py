@@ -14,7 +14,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_path, check_text
+from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_label, check_path, check_text
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, parse_tensors, tensor_bytes, write_bytes
 from torchrl_pomdp.identity import digest
@@ -54,7 +54,7 @@ class Checkpoint:
 
     Raises:
         TypeError: if something is of the wrong kind.
-        ValueError: if ``algorithm`` is no text that can be shown, ``iteration`` is negative, or a base policy has the name.
+        ValueError: if no file can be called by ``algorithm``, ``iteration`` is negative, or a base policy has the name.
     """
 
     problem: Problem
@@ -67,7 +67,7 @@ class Checkpoint:
     def __post_init__(self) -> None:
         check_instance("checkpoint.problem", self.problem, Problem)
         check_instance("checkpoint.config", self.config, PolicyIterationConfig)
-        check_text("checkpoint.algorithm", self.algorithm)
+        check_label("checkpoint.algorithm", self.algorithm)
         check_integer("checkpoint.iteration", self.iteration, 0)
         check_instance("checkpoint.policy", self.policy, TensorDictModuleBase)
         check_instance("checkpoint.value", self.value, PartitionedValue)

@@ -23,12 +23,12 @@ from torchrl_pomdp.checks import check_flag, check_instance, check_seed, check_t
 from torchrl_pomdp.collectors.labels import LabelCollector
 from torchrl_pomdp.config import PolicyIterationConfig
 from torchrl_pomdp.envs.partition import Partition
+from torchrl_pomdp.logs import close_log
 from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.threads import kept_threads
 from torchrl_pomdp.problems.problem import Symmetry
 from torchrl_pomdp.progress import progress_bar
 from torchrl_pomdp.stopping import check_stopped
-from torchrl_pomdp.trainers.logs import close_log
 
 __all__ = ["MEMORY", "PartData", "PartImages", "PartJob", "PartRecord", "Trained", "train_part"]
 

@@ -31,6 +31,7 @@ from torchrl_pomdp.evaluation import Comparison, compare, discounted_costs
 from torchrl_pomdp.files import check_claimed, claim
 from torchrl_pomdp.identity import digest, identity
 from torchrl_pomdp.kept import keep, kept
+from torchrl_pomdp.logs import clear_log
 from torchrl_pomdp.modules import (
     AgentNetwork,
     Encoder,
@@ -47,7 +48,7 @@ from torchrl_pomdp.modules.networks import LocalNetwork
 from torchrl_pomdp.modules.partitioned import local_policies
 from torchrl_pomdp.noise import seed_keys
 from torchrl_pomdp.objectives import ClassificationLoss, ValueLoss
-from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.problems.problem import Problem, Symmetry
 from torchrl_pomdp.trainers.architecture import (
     is_multiagent,
     make_agent_encoder,
@@ -56,7 +57,6 @@ from torchrl_pomdp.trainers.architecture import (
     make_values,
     weightless,
 )
-from torchrl_pomdp.trainers.logs import clear_log
 from torchrl_pomdp.trainers.parts import PartImages, PartJob, PartRecord, records_text, text_records
 from torchrl_pomdp.trainers.plan import Evaluate, Improve, Step, checked_plan
 from torchrl_pomdp.workers import LOCAL, Training, Workers
@@ -161,15 +161,21 @@ class PolicyIteration:
         self.workers = check_instance("workers", workers, Workers)
         workers.check_device(problem.model.device)
         self._scale = problem.pessimistic_cost
-        # Agents that decide in turn cannot change places.
-        keep_order = config.multiagent and problem.model.num_agents > 1
-        symmetries = problem.symmetries[: None if config.symmetries and not keep_order else 1]
-        self._images = PartImages(self.partition, symmetries)
         self._multiagent = is_multiagent(problem, config)
+        self._images = PartImages(self.partition, self._symmetries())
         self._encoder = self._shared_encoder()
         # Value networks share the policy networks' encoder where these see the state as they do.
         self._value_encoder = make_encoder(problem, config) if self._multiagent else self._encoder
         self._start()
+
+    def _symmetries(self) -> list[Symmetry]:
+        """Those whose images are labelled states, too."""
+        identity, *others = self.problem.symmetries
+        if not self.config.symmetries:
+            return [identity]
+        # Agents that decide in turn cannot change places.
+        in_turn = self._multiagent and self.problem.model.num_agents > 1
+        return [identity, *(each for each in others if not in_turn or getattr(each, "keeps_order", False))]
 
     def _shared_encoder(self) -> Encoder:
         """What the policy networks share, the base policy's own too."""
@@ -256,8 +262,10 @@ class PolicyIteration:
         """Load the networks of a step where an interrupted run has trained them; None where it has not."""
         path = self._path(name)
         content = None if path is None else kept(path, f"{self._owner} {name}", self.problem.model.device)
-        if content is None:
+        if path is None or content is None:
             return None
+        # A kill may have come before they were removed.
+        shutil.rmtree(path.with_suffix(".labels"), ignore_errors=True)
         for part, network in networks.items():
             network.load_state_dict(content["networks"][str(part)])
         records = text_records(content["records"])

@@ -200,9 +200,11 @@ class _Execution:
         for name, online in self._online(base).items():
             self._compare(f"{name} of {run.base}", online, run.rollout_states)
         best, policy = self._train(base)
-        # The first one: what the networks have been taught.
-        name, online = next(iter(self._online(policy).items()))
-        self._compare(f"{best} + {name}", online, run.online_states)
+        # On top of the base policy it is evaluated already.
+        if best != run.base or run.online_states > run.rollout_states:
+            # The first one: what the networks have been taught.
+            name, online = next(iter(self._online(policy).items()))
+            self._compare(f"{best} + {name}", online, run.online_states)
         self._write_metrics({})
         return self.results
 
@@ -267,8 +269,9 @@ class _Execution:
 
     def _compare_truncated(self, base: TensorDictModuleBase, value: PartitionedValue) -> None:
         """Evaluate what the networks of the startgame have learnt from, played online, where simulations are cut."""
-        truncated = r_t(self.problem, base, value, trajectories=self.run.online_trajectories)
-        self._compare(f"R-T of {self.run.base}", truncated, self.run.rollout_states)
+        run = self.run
+        truncated = r_t(self.problem, base, value, trajectories=run.online_trajectories, max_steps=run.config.stages)
+        self._compare(f"R-T of {run.base}", truncated, run.rollout_states)
 
     def _keep(self, name: str, checkpoint: Checkpoint) -> None:
         self.check_folder()

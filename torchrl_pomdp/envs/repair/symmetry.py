@@ -53,6 +53,11 @@ class Symmetry:
             every = model.join_controls(self.controls[model.split_controls(every)[:, self.robots]])
         object.__setattr__(self, "joint_controls", every)
 
+    @property
+    def keeps_order(self) -> bool:
+        """Whether no robots change places: also where they decide in turn, the image of a label is one."""
+        return self.robots.tolist() == list(range(len(self.robots)))
+
     def __call__(self, y: TensorDictBase) -> TensorDictBase:
         """The images of feature states and labels ``[*B]``; entries that it does not know are the same for the image.
 
