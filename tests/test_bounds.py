@@ -97,7 +97,7 @@ def test_the_policy_is_that_of_the_library(lookahead, truncation):
 
 
 def result(**changed):
-    sides = {"loss": 1.0, "loss_bound": 2.0, "rise": -1.0, "rise_bound": 4.0, "sharp_rise_bound": 3.0, "scale": 10.0}
+    sides = {"loss": 1.0, "loss_bound": 2.0, "rise": -1.0, "rise_bound": 4.0, "sharp_rise_bound": 3.0, "rounding": 1e-8}
     return ErrorBounds(lookahead=1, truncation=0, **{**sides, **changed})
 
 
@@ -107,6 +107,17 @@ def test_what_does_not_hold_is_seen():
     assert not result(rise=3.5).hold
     assert not result(rise=5.0, sharp_rise_bound=9.0).hold
     assert result(loss=2.0 + 1e-9).hold
+
+
+@pytest.mark.parametrize("discount", [1 - 1e-8, 1 - 1e-10])
+def test_rounding_refutes_no_bound_near_a_discount_of_1(discount):
+    moves = torch.rand(2, 4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    moves = moves / moves.sum(-1, keepdim=True)
+    seen = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
+    model = TabularModel(moves, seen, torch.ones(2, 4, dtype=torch.float64), discount, dtype=torch.float64)
+    mdp = belief_mdp(model, torch.eye(4, dtype=torch.float64)[0])
+    first = torch.zeros(len(mdp), dtype=torch.int64)
+    assert error_bounds(mdp, first, mdp.policy_cost(first)).hold
 
 
 def test_the_table_of_looseness():

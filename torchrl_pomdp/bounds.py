@@ -69,7 +69,8 @@ class ErrorBounds(NamedTuple):
         rise: the largest :math:`J_{\tilde\mu}(y)-J_\mu(y)`, left side of (b); negative where the policy improves everywhere.
         rise_bound: :math:`\frac{2}{1-\alpha}\|\hat J-J_\mu\|`, right side of (b).
         sharp_rise_bound: the same times :math:`\alpha^{\ell+m}`.
-        scale: largest absolute cost among those that were compared, by which rounding is measured.
+        rounding: what rounding may do: a billionth of the largest absolute cost among those that were compared, or, with a
+            discount very near 1, what it does to the solution of :math:`J=T_\mu J`.
     """
 
     lookahead: int
@@ -79,13 +80,13 @@ class ErrorBounds(NamedTuple):
     rise: float
     rise_bound: float
     sharp_rise_bound: float
-    scale: float
+    rounding: float
 
     @property
     def hold(self) -> bool:
-        """Whether all three inequalities hold, up to rounding: a billionth of the costs."""
-        slack = _ROUNDING * self.scale
-        return self.loss <= self.loss_bound + slack and self.rise <= min(self.rise_bound, self.sharp_rise_bound) + slack
+        """Whether all three inequalities hold, up to rounding."""
+        rise_bound = min(self.rise_bound, self.sharp_rise_bound)
+        return self.loss <= self.loss_bound + self.rounding and self.rise <= rise_bound + self.rounding
 
 
 def error_bounds(
@@ -128,6 +129,7 @@ def error_bounds(
         ahead = mdp.q_factors(ahead).amin(-1)
     made = mdp.policy_cost(mdp.q_factors(ahead).argmin(-1))
     factor = 2.0 / (1.0 - mdp.discount)
+    share = max(_ROUNDING, len(mdp) * torch.finfo(torch.float64).eps * factor)
     rise_bound = factor * _norm(terminal - base)
     return ErrorBounds(
         lookahead,
@@ -137,7 +139,7 @@ def error_bounds(
         rise=float((made - base).max()),
         rise_bound=rise_bound,
         sharp_rise_bound=rise_bound * mdp.discount ** (lookahead + truncation),
-        scale=max(_norm(values) for values in (made, base, best, terminal)),
+        rounding=share * max(_norm(values) for values in (made, base, best, rolled, terminal)),
     )
 
 
@@ -242,7 +244,7 @@ def _sides(results: Sequence[ErrorBounds]) -> dict[str, dict[int, list[tuple[flo
     for found in results:
         pairs = ((found.loss, found.loss_bound), (found.rise, found.rise_bound), (found.rise, found.sharp_rise_bound))
         for name, pair in zip(sides, pairs, strict=True):
-            if pair[0] > _ROUNDING * found.scale:
+            if pair[0] > found.rounding:
                 sides[name].setdefault(found.lookahead, []).append(pair)
     return sides
 

@@ -13,7 +13,8 @@ from tensordict import TensorDict
 from torchrl_pomdp.envs import TabularModel
 from torchrl_pomdp.envs.repair import Graph, RepairModel, UniformStart, damage_chain, joint_belief, line, tabular_model
 from torchrl_pomdp.evaluation import compare, discounted_costs
-from torchrl_pomdp.modules import Myopic
+from torchrl_pomdp.modules import Myopic, PartitionedPolicy
+from torchrl_pomdp.modules.lookahead import simulated_steps
 from torchrl_pomdp.modules.repair import GreedyRepair, UrgencyRepair
 from torchrl_pomdp.planners import DESPOT, POMCP, solve, tree_search
 from torchrl_pomdp.planners import despot as despot_module
@@ -390,3 +391,64 @@ def test_locations_that_share_a_bit_do_not_break_the_relaxation(size):
     for seed in range(20):
         low, high = DESPOT(model, GreedyRepair(model), simulations=5, scenarios=1, seed=seed).bounds(y)
         assert 0.0 < float(low) <= float(high)
+
+
+@pytest.mark.parametrize("policies", [("myopic", None), (None, "myopic")])
+def test_a_base_policy_that_is_replaced_is_simulated(make, policies):
+    """Compiled loops are for one policy; nothing would see that they are called with another one's data."""
+    problem = make_problem("tiger")
+    model, y = problem.model, problem.start(torch.arange(2))
+    first, second = (None if name is None else Myopic(model) for name in policies)
+    search = make(model, first)
+    search(y.clone())
+    search.base_policy = second
+    assert torch.equal(search(y.clone())["q_factors"], make(model, second)(y.clone())["q_factors"])
+
+
+def test_a_base_policy_that_is_replaced_by_one_with_other_data_is_simulated(make, linear20):
+    y = linear20.start(torch.arange(2))
+    search = make(linear20.model, GreedyRepair(linear20.model))
+    search(y.clone())
+    search.base_policy = UrgencyRepair(linear20.model)
+    expected = make(linear20.model, UrgencyRepair(linear20.model))(y.clone())["q_factors"]
+    assert torch.equal(search(y.clone())["q_factors"], expected)
+
+
+def test_what_compiled_simulations_are_made_for_is_fixed(make, line3):
+    search = make(line3.model, UrgencyRepair(line3.model), max_steps=60)
+    with pytest.raises(AttributeError):
+        search.max_steps = 1
+    assert search.max_steps == 60
+
+
+def test_beliefs_that_add_up_to_a_little_more_than_one_are_no_fault_of_the_model():
+    """Thirds in single precision do: a cost of -1 at every stage is then a little less than any bound of it."""
+    model = TabularModel(torch.eye(3).expand(2, 3, 3), torch.ones(2, 3, 1), -torch.ones(2, 3), 0.5)
+    y = TensorDict({"belief": torch.full((1, 3), 1 / 3)}, [1])
+    assert float(y["belief"].double().sum()) > 1.0
+    for bound in ("trivial", "relaxed"):
+        search = DESPOT(model, None, simulations=5, bound=bound, max_steps=100)
+        assert search(y.clone())["q_factors"].tolist() == [[-2.0, -2.0]]
+
+
+def test_beliefs_without_a_legal_control_are_not_blamed_on_a_base_policy(make):
+    half = torch.tensor([[0.0, 0.5, 0.5], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).expand(2, 3, 3)
+    legal = torch.tensor([[True, True], [True, False], [False, True]])
+    model = TabularModel(half, torch.ones(2, 3, 1), torch.ones(2, 3), 0.5, legal=legal)
+    with pytest.raises(ValueError, match="y must not lead to beliefs whose states share no legal control"):
+        make(model, None)(TensorDict({"belief": torch.eye(3)[:1]}, [1]))
+
+
+def test_tables_that_are_too_large_are_named(make):
+    size = 1500
+    moves = torch.eye(size).to_sparse()
+    model = TabularModel(torch.stack([moves, moves]), torch.ones(2, size, 1), torch.ones(2, size), 0.9)
+    with pytest.raises(ValueError, match="whose tables hold at most 4,194,304 numbers"):
+        make(model, None)
+
+
+def test_simulations_are_counted_inside_of_other_modules(make, line3):
+    search = make(line3.model, UrgencyRepair(line3.model))
+    policy = PartitionedPolicy([search] * line3.partition.num_parts)
+    policy(line3.model.with_features(line3.start(torch.arange(2))))
+    assert simulated_steps(policy) == search.simulated_steps > 0

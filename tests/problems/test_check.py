@@ -8,6 +8,7 @@ from torchrl.data import Bounded, Categorical, Composite
 from torchrl_pomdp.envs import BeliefModel, FixedBelief, TabularModel
 from torchrl_pomdp.envs.repair import RandomState, RepairModel, damage_chain, line
 from torchrl_pomdp.envs.sums import sum_first
+from torchrl_pomdp.noise import uniform
 from torchrl_pomdp.problems import make_problem, tiger
 from torchrl_pomdp.problems.check import check_belief_model
 
@@ -354,3 +355,47 @@ class Observes(Machine):
 def test_an_entry_may_not_have_the_name_of_what_is_seen():
     with pytest.raises((AssertionError, ValueError), match="observation"):
         check_belief_model(Observes(), start)
+
+
+def scaled(kind, unit):
+    model = tiger().model
+    found = kind(model.transition, model.observation, unit * model.cost, model.discount)
+    # It would be found out by its bound of costs.
+    found.max_cost = None
+    return found
+
+
+class Thrice(TabularModel):
+    """A sampled step costs three times what is expected."""
+
+    def advance(self, y, u, noise):
+        cost, nxt = super().advance(y, u, noise)
+        return 3 * cost, nxt
+
+
+class Curved(TabularModel):
+    """A stage cost that is no expectation."""
+
+    def expected_cost(self, y, u):
+        return super().expected_cost(y, u) * (1 + y["belief"][..., 0])
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_the_unit_of_costs_changes_no_verdict(unit):
+    check_belief_model(scaled(TabularModel, unit), tiger().start)
+    with pytest.raises(AssertionError, match="advance: its stage cost is expected_cost"):
+        check_belief_model(scaled(Thrice, unit), tiger().start)
+    with pytest.raises(AssertionError, match="expected_cost: "):
+        check_belief_model(scaled(Curved, unit), tiger().start)
+
+
+def test_large_costs_that_cancel_out_are_no_fault():
+    """What is left of them is rounded as they are."""
+    costs = [[1e6, -1e6, 3.0], [1e6, -1e6, 3.0]]
+    model = TabularModel(torch.eye(3).expand(2, 3, 3), torch.ones(2, 3, 1), costs, 0.9)
+
+    def start(keys):
+        first, little = 0.1 + 0.3 * uniform(keys, 0), 1e-5 * uniform(keys, 1)
+        return TensorDict({"belief": torch.stack([first + little, first, 1 - 2 * first - little], -1)}, keys.shape)
+
+    check_belief_model(model, start)

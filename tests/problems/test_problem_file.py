@@ -200,6 +200,7 @@ def test_foreign_files_are_refused(path, content):
         (".os:make", "problem must name a module"),
         ("math:pi", "math:pi must be a function, got 3.14"),
         ("os:mkdir", "os:mkdir must be a function without arguments"),
+        ("builtins:dict", "builtins:dict must be a function without arguments"),
     ],
 )
 def test_what_names_no_problem(text, message):

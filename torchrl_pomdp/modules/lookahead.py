@@ -2,13 +2,13 @@ r"""One-step lookahead with rollout at its leaves: the policy :math:`\tilde\mu` 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_instance, check_number
 from torchrl_pomdp.modules.qfactors import SimulatedQFactors, cheapest
@@ -75,13 +75,20 @@ class RolloutPolicy(SimulatedQFactors):
 
 
 def simulated_steps(policy: Callable[..., Any]) -> int | None:
-    """Belief steps that a policy, or the rollouts in it, have simulated; None where it simulates nothing."""
+    """Belief steps that a policy, or the rollouts and searches in it, have simulated; None where it simulates nothing."""
     if not isinstance(policy, TensorDictModuleBase):
         return None
-    if hasattr(policy, "simulated_steps"):
-        return int(policy.simulated_steps)
-    parts = {part for part in policy.modules() if isinstance(part, RolloutPolicy)}
-    return sum(part.simulated_steps for part in parts) if parts else None
+    found = {part: part.simulated_steps for part in _simulating(policy)}
+    return sum(found.values()) if found else None
+
+
+def _simulating(module: nn.Module) -> Iterator[Any]:
+    """The outermost modules that count what they simulate."""
+    if hasattr(module, "simulated_steps"):
+        yield module
+        return
+    for part in module.children():
+        yield from _simulating(part)
 
 
 def _checked_keys(keys: Tensor, y: TensorDictBase) -> Tensor:

@@ -19,6 +19,7 @@ from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.truncation import Truncation
 
 __all__ = [
+    "MOST_NUMBERS",
     "Allocation",
     "Cut",
     "Limited",
@@ -29,6 +30,10 @@ __all__ = [
     "offer_engines",
     "scalar_engine",
 ]
+
+
+MOST_NUMBERS = 1 << 22
+"""The most numbers in tables of compiled simulations: every entry may be read at every step."""
 
 
 class Cut(NamedTuple):

@@ -81,7 +81,7 @@ class BeliefMDP:
         return torch.linalg.solve(system, self.cost.gather(1, u).squeeze(1))
 
     def optimal_cost(self) -> Tensor:
-        r""":math:`J^*` ``[M]``, by policy iteration."""
+        r""":math:`J^*` ``[M]``, by policy iteration; up to :math:`10^{-12}/(1-\alpha)^2` of the largest stage cost."""
         controls = self.cost.argmin(-1)
         equal = _EQUAL * self.cost[self.cost.isfinite()].abs().max() / (1.0 - self.discount)
         while True:

@@ -39,7 +39,8 @@ class DESPOT(TreeSearch):
     trivial bounds an exploration goes down to depth D; a decision needs time for several, or what they explored is overrated.
 
     Args:
-        model: the belief model; it needs a scalar twin, as repair and tabular models have.
+        model: the belief model; it needs a scalar twin, as repair and tabular models have unless their
+            tables are very large.
         base_policy: default policy with a scalar twin; None: any legal control, all equally likely, drawn anew
             in every scenario and at every stage. It reads histories only.
 

@@ -111,7 +111,10 @@ class AlphaVectorPolicy(TensorDictModuleBase):
         return tensordict.set("action", torch.where(u == ANY, mask.to(torch.int8).argmax(-1), u))
 
     def cost(self, y: TensorDictBase) -> Tensor:
-        """Cost of the best plan, float64 ``[*B]``: the policy costs no more.
+        """Cost of the best plan, float64 ``[*B]``.
+
+        The policy costs no more if each plan goes on, after every observation, with one of these vectors, as those of
+        :func:`solve` do.
 
         Args:
             y: feature states ``[*B]``.
@@ -221,7 +224,7 @@ def solve(
     until = begin + check_number("seconds", seconds, "(0, inf)")
     check_flag("progress", progress)
     table = JointTable(model)
-    largest = max(-table.lowest, table.highest)
+    largest = max(abs(table.lowest), abs(table.highest))
     # Bounds are added up and subtracted.
     if not math.isfinite(4.0 * largest / (1.0 - table.discount)):
         raise ValueError(f"model must have smaller costs, got a discounted sum of up to {largest:g}: it overflows")

@@ -21,7 +21,7 @@ __all__ = ["Floats", "Integers", "JointTable"]
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Where the first bounds stop to move: relative to their size, and stages at most.
+# Where the first bounds stop to move: what is left to go, relative to their size, and stages at most.
 _SETTLED, _MOST_ROUNDS = 1e-7, 20_000
 
 
@@ -72,10 +72,11 @@ class JointTable:
         self.free = self._free()
         finite = self.cost[np.isfinite(self.cost)]
         self.largest_cost = float(np.abs(finite).max())
-        # A little more than the quotient, which is rounded.
-        stages = (1.0 + 4.0 * float(np.finfo(np.float64).eps)) / (1.0 - self.discount)
-        self.lowest = min(0.0, float(finite.min())) * stages
-        self.highest = max(0.0, float(finite.max())) * stages
+        lowest, highest = float(finite.min()), float(finite.max())
+        # The quotient is rounded: a little further out, whatever the sign.
+        little = 4.0 * float(np.finfo(np.float64).eps)
+        self.lowest = (lowest - little * abs(lowest)) / (1.0 - self.discount)
+        self.highest = (highest + little * abs(highest)) / (1.0 - self.discount)
 
     def spread(self, u: int, states: Integers, probs: Floats) -> Floats:
         """P(observation z, next state j) ``[Z, n]`` after control ``u`` at a belief, given by its support."""
@@ -102,7 +103,7 @@ class JointTable:
         for _ in range(_MOST_ROUNDS):
             steps = self._steps(value).max(0, where=np.isfinite(self.cost), initial=-np.inf)
             before, value = value, np.where(self.free, 0.0, np.minimum(value, steps))
-            if np.abs(before - value).max() <= _SETTLED * max(1.0, np.abs(value).max()) or monotonic() >= until:
+            if self._settled(before, value) or monotonic() >= until:
                 break
         return value
 
@@ -111,7 +112,7 @@ class JointTable:
         value = np.where(self._lasting(u), start, np.inf)
         for _ in range(_MOST_ROUNDS):
             before, value = value, np.minimum(value, self._step(u, value))
-            if np.allclose(before, value, rtol=_SETTLED, atol=_SETTLED) or monotonic() >= until:
+            if self._settled(before, value) or monotonic() >= until:
                 break
         return value
 
@@ -126,7 +127,7 @@ class JointTable:
         for _ in range(_MOST_ROUNDS):
             steps = np.stack([self._informed_step(u, q) for u in range(self.num_controls)], 1)
             before, q = q, np.maximum(q, steps)
-            if np.allclose(before, q, rtol=_SETTLED, atol=_SETTLED) or monotonic() >= until:
+            if self._settled(before, q) or monotonic() >= until:
                 break
         return q
 
@@ -134,6 +135,13 @@ class JointTable:
     def terms(self) -> int:
         """The most numbers that are added up for one number of a backup or of a belief."""
         return self.num_states + max(int(np.diff(each.rows, append=len(each.p)).max()) for each in self.controls)
+
+    def _settled(self, before: Floats, after: Floats) -> bool:
+        """Whether a bound hardly moves any more: what is left to go is at most a stage's move over 1 - discount."""
+        finite = np.isfinite(after)
+        move, size = (np.abs(each).max(initial=0.0) for each in (before[finite] - after[finite], after[finite]))
+        settled: bool = move <= _SETTLED * (1.0 - self.discount) * max(size, self.largest_cost)
+        return settled
 
     def _steps(self, value: Floats) -> Floats:
         return np.stack([self._step(u, value) for u in range(self.num_controls)])

@@ -337,4 +337,7 @@ class Search:
 
 
 def _stuck(node: Node) -> ValueError:
-    return ValueError(f"belief must not lead to one whose states share no legal control, such as {node.states.tolist()}")
+    return ValueError(
+        "belief must not lead to one whose states share no legal control: "
+        f"one of the states {node.states.tolist()} is such a belief, or leads to one whatever is done"
+    )

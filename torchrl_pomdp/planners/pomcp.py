@@ -34,7 +34,8 @@ class POMCP(TreeSearch):
     the tree grows. With random play for a base policy that takes very long.
 
     Args:
-        model: the belief model; it needs a scalar twin, as repair and tabular models have.
+        model: the belief model; it needs a scalar twin, as repair and tabular models have unless their
+            tables are very large.
         base_policy: rollout policy with a scalar twin; None: any legal control, all equally likely.
 
     Keyword Args:

@@ -21,7 +21,7 @@ from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.modules.own import MakesItsOwn
 from torchrl_pomdp.modules.policies import Policy, check_policy
 from torchrl_pomdp.modules.rollout import check_max_steps
-from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine, local_engine, makeup, scalar_engine
+from torchrl_pomdp.modules.scalar import MOST_NUMBERS, Limited, Roots, SearchEngine, local_engine, makeup, scalar_engine
 from torchrl_pomdp.modules.threads import map_threads
 from torchrl_pomdp.stopping import check_stopped
 
@@ -120,18 +120,24 @@ class TreeSearch(MakesItsOwn, TensorDictModuleBase):
         self.in_keys = list(model.state_keys)
         self.base_policy = None if base_policy is None else check_policy("base_policy", base_policy, model)
         self.budget = Budget(simulations, seconds)
-        self.max_steps = check_max_steps(max_steps, model)
+        self._max_steps = check_max_steps(max_steps, model)
         self.seed = check_integer("seed", seed)
         self._prepare()
 
     def _prepare(self) -> None:
         self.simulated_steps = 0
         self._lock = Lock()
-        self._loops: Any = None
         self._prepare_engine()
 
     def _prepare_engine(self) -> None:
         self.engine, self._makeup = self._engine(), makeup(self.base_policy)
+        # They are compiled for the policy.
+        self._loops: Any = None
+
+    @property
+    def max_steps(self) -> int:
+        """Stages after which simulations end; fixed, as compiled simulations are made for it."""
+        return self._max_steps
 
     def _engine(self) -> SearchEngine:
         if find_spec("numba") is None:
@@ -145,7 +151,10 @@ class TreeSearch(MakesItsOwn, TensorDictModuleBase):
             return engine
         of_model = type(self.model).__name__
         if self.base_policy is None or local_engine((), self.model, limits) is None:
-            raise ValueError(f"model must have a scalar twin, as repair and tabular models on a CPU have, got {of_model}")
+            raise ValueError(
+                f"model must have a scalar twin, as repair and tabular models on a CPU have whose tables hold at most "
+                f"{MOST_NUMBERS:,} numbers, got {of_model}"
+            )
         raise ValueError(
             f"base_policy must have a scalar twin for this very model, a {of_model}, got {type(self.base_policy).__name__}"
         )
@@ -198,7 +207,9 @@ class TreeSearch(MakesItsOwn, TensorDictModuleBase):
         return self._loops(function, *args)
 
     def check_legal(self, well: bool) -> None:
-        """Raise unless all was well with the base policy's controls."""
+        """Raise unless all was well with the controls of a simulation."""
+        if not well and self.base_policy is None:
+            raise ValueError("y must not lead to beliefs whose states share no legal control; a simulation came to one")
         if not well:
             raise ValueError("base_policy chose an illegal control in a simulation; its scalar twin must choose a legal one")
 

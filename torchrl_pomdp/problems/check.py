@@ -22,6 +22,7 @@ from torchrl_pomdp.problems.check_laws import (
     check_advance,
     check_bayes,
     check_terminal,
+    cost_size,
     entries_of,
     legal_pairs,
     noise_of,
@@ -80,12 +81,13 @@ def check_belief_model(model: BeliefModel, generator: StateGenerator, *, seed: i
         _check_costs(probe, pairs)
         outcomes = _enumerated(probe, pairs)
         _check_batches(probe, pairs, outcomes)
-        check_advance(probe, pairs, outcomes, seed)
-        check_terminal(probe, terminal, float(probe.cost(pairs.y, pairs.u).abs().max()), seed)
+        size = cost_size(model, probe.cost(pairs.y, pairs.u))
+        check_advance(probe, pairs, outcomes, size, seed)
+        check_terminal(probe, terminal, size, seed)
         if outcomes is not None:
-            check_bayes(probe, pairs, outcomes)
-        check_engine(model, starts, seed)
-        check_environment(model, generator, starts, seed)
+            check_bayes(probe, pairs, outcomes, size)
+        check_engine(model, starts, size, seed)
+        check_environment(model, generator, starts, size, seed)
 
 
 def _check_attributes(model: BeliefModel) -> None:
@@ -215,7 +217,6 @@ def _check_costs(probe: Probe, pairs: Pairs) -> None:
             lambda i: f"expected_cost {float(cost[i]):g} for control {int(pairs.u[i])}",
             "Give a bound of all stage costs, or None.",
         )
-    probe.observed(pairs.y, pairs.u)
 
 
 def _enumerated(probe: Probe, pairs: Pairs) -> Outcomes | None:

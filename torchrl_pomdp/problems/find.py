@@ -57,7 +57,7 @@ def _own_problem(text: str) -> Problem:
         raise TypeError(f"{text} must be a function, got {shown(make)}")
     try:
         inspect.signature(make).bind()
-    except TypeError as error:
+    except (TypeError, ValueError) as error:  # the latter where Python does not know the arguments
         raise TypeError(f"{text} must be a function without arguments: {error}") from error
     problem = make()
     if not isinstance(problem, Problem):

@@ -53,8 +53,9 @@ def scalar_twin(function: Callable[..., None]) -> ScalarTwin:
     """Make a scalar twin of a policy from ``function(data, view, controls)``.
 
     The function writes the control of every robot into ``controls`` (int64 ``[R]``). ``data`` is what the policy offers with
-    the twin, a tuple of arrays and numbers; ``view`` is what the simulation shows, see
-    :class:`~torchrl_pomdp.modules.repair.scalar.View`. It is compiled by numba, and may call functions that are.
+    the twin, a tuple of arrays and numbers; ``view`` is what the simulation shows, for repair models a
+    :class:`~torchrl_pomdp.modules.repair.scalar.View`, for tabular ones a
+    :class:`~torchrl_pomdp.modules.tabular.TabularView`. It is compiled by numba, and may call functions that are.
 
     Examples:
         >>> @scalar_twin

@@ -9,15 +9,12 @@ from tensordict import TensorDictBase
 
 from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.envs.tabular import TabularModel
-from torchrl_pomdp.modules.scalar import Limited, Roots, SearchEngine
+from torchrl_pomdp.modules.scalar import MOST_NUMBERS, Limited, Roots, SearchEngine
 from torchrl_pomdp.modules.tabular.searches import TabularHistory, TabularTables, tabular_model
 from torchrl_pomdp.noise import fold
 from torchrl_pomdp.scalar.twins import ScalarTwin
 
 __all__ = ["TabularEngine", "tabular_engine"]
-
-# Largest tables, in numbers: every entry is read at every step.
-_MOST_NUMBERS = 1 << 22
 
 
 def tabular_engine(twin: ScalarTwin, data: tuple[Any, ...], model: BeliefModel, limits: Limited) -> TabularEngine | None:
@@ -40,7 +37,7 @@ def tabular_engine(twin: ScalarTwin, data: tuple[Any, ...], model: BeliefModel, 
     if type(model) is not TabularModel or limits.truncation is not None or limits.terminal_cost is not None:
         return None
     size = model.num_controls * model.num_states * max(model.num_states, model.num_observations)
-    return TabularEngine((twin, data), model, limits) if size <= _MOST_NUMBERS else None
+    return TabularEngine((twin, data), model, limits) if size <= MOST_NUMBERS else None
 
 
 class TabularEngine(SearchEngine):
@@ -68,6 +65,8 @@ class TabularEngine(SearchEngine):
         """See :class:`SearchEngine`."""
         model = self.model
         beliefs = np.ascontiguousarray(y.get("belief").reshape(-1, model.num_states).double().numpy())
+        # Bounds of costs hold for distributions in double precision.
+        beliefs /= beliefs.sum(-1, keepdims=True)
         keys = fold(model.fingerprint(y).reshape(-1), seed)
 
         def state(number: int) -> TabularHistory:

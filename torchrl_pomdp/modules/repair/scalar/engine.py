@@ -27,7 +27,7 @@ from torchrl_pomdp.modules.repair.scalar.states import fingerprints, valid
 from torchrl_pomdp.modules.repair.scalar.tables import by_location, kinds, make_tables
 from torchrl_pomdp.modules.repair.scalar.trajectories import NEVER, Limits, Trajectories, Work, simulate
 from torchrl_pomdp.modules.repair.terminal_costs import NeverRepairCost, SteadyStateCost
-from torchrl_pomdp.modules.scalar import Allocation, Cut, Limited, Roots, ScalarEngine, makeup
+from torchrl_pomdp.modules.scalar import MOST_NUMBERS, Allocation, Cut, Limited, Roots, ScalarEngine, makeup
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.terminal_costs import ConstantCost, ZeroCost
 from torchrl_pomdp.modules.threads import map_threads
@@ -38,8 +38,6 @@ from torchrl_pomdp.tensor_checks import SUM_TOLERANCE
 
 __all__ = ["RepairEngine", "repair_engine"]
 
-# Largest tables, in numbers; beyond, the tensors' way is taken.
-_MOST_NUMBERS = 1 << 22
 # Rows and states of a call of a compiled loop, which nothing can interrupt.
 _ROWS, _STATES = 4096, 256
 
@@ -105,7 +103,7 @@ def repair_engine(
     known = all(type(rule) in (AfterSteps, OnEntering, OnLeaving) for rule in rules)
     parted = all(isinstance(rule, AfterSteps) for rule in rules) or type(model.partition) in (RepairPartition, SinglePart)
     table_size = len(kinds(model)[0]) * (limits.max_steps + 2) * model.num_levels**2
-    small = table_size <= _MOST_NUMBERS and model.num_locations**2 <= _MOST_NUMBERS
+    small = table_size <= MOST_NUMBERS and model.num_locations**2 <= MOST_NUMBERS
     if not (known and parted and small):
         return None
     return RepairEngine((twin, data), model, limits, rules, numbers, refresh)
@@ -228,7 +226,7 @@ class RepairEngine(ScalarEngine):
             return steps
 
         # Their trajectories' costs are kept until a state is decided. With a time for each, states are decided one by one.
-        block = max(1, min(_STATES, _MOST_NUMBERS // (len(allocation.order) * shape[1])))
+        block = max(1, min(_STATES, MOST_NUMBERS // (len(allocation.order) * shape[1])))
         return q, sum(self._threads(run, shape[0], block if allocation.seconds is None else 1))
 
     @cached_property
