@@ -271,7 +271,7 @@ FILES = {
     "checks.check_flag": lambda _: a_check(checks.check_flag, True, flags()),
     "checks.check_choice": lambda _: a_check(checks.check_choice, "soft", choices(), allowed=("soft", "l2")),
     "checks.check_text": lambda _: a_check(checks.check_text, "x", texts()),
-    "checks.check_label": lambda _: a_check(checks.check_label, "x", [*texts(), *values("../x", "a/b", "x" * 200)]),
+    "checks.check_label": lambda _: a_check(checks.check_label, "x", [*texts(), *values("../x", "x" * 200, "\u6f22" * 34)]),
     "checks.check_path": lambda _: a_check(checks.check_path, "x", paths()),
     "checks.check_instance": lambda _: a_check(checks.check_instance, model(), objects(), kind=type(model())),
     "checks.check_callable": lambda _: a_check(checks.check_callable, len, not_callable()),

@@ -337,3 +337,14 @@ def test_what_pickling_alone_tells_and_what_a_function_reads_is_told(monkeypatch
     assert digest(weighted) != before
     with pytest.raises(TypeError, match="cannot be told"):
         digest(threading.Lock())
+
+
+def test_what_is_no_tensor_in_a_tensordict_counts():
+    one, other, same = (TensorDict({"x": torch.zeros(2), "name": text}, []) for text in ("a", "b", "a"))
+    assert digest(one) == digest(same) != digest(other)
+
+
+def test_attributes_of_partial_functions_count():
+    one, other = functools.partial(default), functools.partial(default)
+    other.rate = 2
+    assert digest(one) == digest(functools.partial(default)) != digest(other)

@@ -103,8 +103,8 @@ def test_an_experiment_writes_its_results_and_goes_on(tmp_path, monkeypatch):
     assert told[1].startswith("pictures: ")
     stem = "toy-tuned-greedy-scale0.001-seed0"
     content = json.loads((tmp_path / "results" / "toy" / f"{stem}.json").read_text())
-    assert content["provenance"]["versions"]["torch"] == torch.__version__
-    assert content["provenance"]["commit"] == provenance()["commit"]
+    assert content["provenance"] == {name: [provenance()] for name in content["runs"]}
+    assert provenance()["versions"]["torch"] == torch.__version__
     assert {run["algorithm"] for run in content["runs"].values()} == {"pAPI-NT", "pAPI-T"}
     for name, found in content["results"].items():
         assert {"greedy", "urgency"} <= set(found)
@@ -264,3 +264,22 @@ def test_extensions_are_run_like_the_papers_problems():
     runs = plan(EXPERIMENTS["extensions"], "tuned", "urgency", 0.01, 0)
     assert [run.problem.name for run in runs.values()] == list(EXPERIMENTS["extensions"].problems)
     assert all((run.algorithm, run.base, run.config.multiagent) == ("pAPI-NT", "urgency", False) for run in runs.values())
+
+
+def test_a_folder_in_use_is_refused_before_anything_is_computed(tmp_path):
+    *_, last = plan(TOY, "tuned", "greedy", 0.001, 0)
+    (tmp_path / "runs" / last).mkdir(parents=True)
+    (tmp_path / "runs" / last / "mine.txt").write_text("mine")
+    with pytest.raises(ValueError, match=f"run folder .*{last} holds other files"):
+        reproduce(TOY, scale=0.001, runs=tmp_path / "runs", out=tmp_path / "results")
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["mine.txt"]
+
+
+def test_bars_of_fewer_start_states_say_so():
+    pytest.importorskip("matplotlib")
+    cost = torch.tensor([1.0, 2.0, 300.0])
+    results = [Result("greedy", compare(cost, cost)), Result("R-NT", compare(1.5 * cost[:2], cost[:2]))]
+    axes = cost_figure(results).axes[0]
+    names = [text.get_text() for text in axes.get_xticklabels()]
+    assert names == ["greedy\n1.000", "R-NT\n1.500\nfrom 2 states"]
+    assert [bar.get_hatch() for bar in axes.patches] == [None, "//"]

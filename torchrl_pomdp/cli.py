@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -202,9 +206,22 @@ class Problems:
     """List the known problems with their numbers of states, controls and observations."""
 
 
+@contextmanager
+def _interrupted_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM, a batch system's way to end a program, do what Ctrl-C does: temporary files go, workers are released."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the command with ``args`` (default: the process's); returns the exit status: 2 for input that was refused, 1 for
-    work that has failed elsewhere, 130 for Ctrl-C, 141 if nobody reads the output any more.
+    work that has failed elsewhere, 130 for Ctrl-C and SIGTERM, 141 if nobody reads the output any more.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         # What a terminal cannot show is no reason to lose a table.
@@ -235,21 +252,22 @@ def main(args: list[str] | None = None) -> int:
         return 130
     logger.setLevel("WARNING")
     try:
-        if isinstance(command, Train):
-            commands.train(command)
-        elif isinstance(command, Evaluate):
-            commands.evaluate(command)
-        elif isinstance(command, Compare):
-            commands.compare(command)
-        elif isinstance(command, Changes):
-            commands.changes(command)
-        elif isinstance(command, Reproduce):
-            commands.reproduce(command)
-        elif isinstance(command, Report):
-            commands.report(command)
-        else:
-            commands.problems()
-        sys.stdout.flush()
+        with _interrupted_by_sigterm():
+            if isinstance(command, Train):
+                commands.train(command)
+            elif isinstance(command, Evaluate):
+                commands.evaluate(command)
+            elif isinstance(command, Compare):
+                commands.compare(command)
+            elif isinstance(command, Changes):
+                commands.changes(command)
+            elif isinstance(command, Reproduce):
+                commands.reproduce(command)
+            elif isinstance(command, Report):
+                commands.report(command)
+            else:
+                commands.problems()
+            sys.stdout.flush()
     except BrokenPipeError:
         # As by `| head`. What is left to write goes nowhere, so that the interpreter need not complain about it at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

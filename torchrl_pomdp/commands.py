@@ -27,7 +27,7 @@ from torchrl_pomdp.modules.rollout import MAX_STEPS
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems import PRESETS, Problem, make_problem
 from torchrl_pomdp.problems.find import find_problem
-from torchrl_pomdp.provenance import provenance
+from torchrl_pomdp.provenance import known_provenance
 from torchrl_pomdp.report import Result, cost_figure, draw, interval_text, peer_figure, peer_table, ratio_texts, table
 from torchrl_pomdp.report.page import write_report
 from torchrl_pomdp.report.player import side_by_side
@@ -64,7 +64,6 @@ def train(command: Train) -> None:
         comparisons = run.carry_out(out, progress=True, report=partial(_tell, problem.baseline), workers=workers)
     results = [Result(name, comparison) for name, comparison in comparisons.items()]
     print(f"\n{table(results)}\n", flush=True)
-    write_json(out / "provenance.json", provenance())
     best = load_checkpoint(out / "best.pt", problem=problem)
     title = f"{problem.name}, {command.states} start states"
     figures = {
@@ -177,9 +176,10 @@ def compare(command: Compare) -> None:
     about = {**asdict(command), **{key: str(getattr(command, key)) for key in ("checkpoint", "runs", "out")}}
     about |= {"methods": command.methods and list(command.methods), "policy": given and digest(given.policy)}
     _check_same(out / f"{name}.json", about)
+    folder = runs / f"{name}-seed{command.seed}"
     outcomes = compare_peers(
         problem,
-        runs / f"{name}-seed{command.seed}",
+        folder,
         checkpoint=given,
         ppo_steps=None if given is None or not ppo else _ppo_steps(cast(Path, command.checkpoint).parent, given),
         methods=command.methods,
@@ -191,7 +191,7 @@ def compare(command: Compare) -> None:
     )
     text = f"{problem.name}, {command.states} start states, {command.seconds:g} s a decision\n\n{peer_table(outcomes)}"
     found = {method: each.to_dict() for method, each in outcomes.items()}
-    write_json(out / f"{name}.json", {"command": about, "provenance": provenance(), "outcomes": found})
+    write_json(out / f"{name}.json", {"command": about, "provenance": known_provenance(folder), "outcomes": found})
     write_bytes(out / f"{name}.md", f"{text}\n".encode())
     print(f"\n{text}\n", flush=True)
     results = [Result(method, outcome.comparison) for method, outcome in outcomes.items()]

@@ -217,11 +217,25 @@ def claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
         ['config.json']
     """
     path = check_path("path", path)
+    text = _json("identity", check_instance("identity", identity, dict))
+    if path.is_file() or not _write_new(path, text.encode()):
+        check_claim(path, identity)
+
+
+def check_claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
+    """Raise where a record that is there says that the folder is another one's, see :func:`claim`; nothing is written.
+
+    Args:
+        path: the record.
+        identity: whose the folder should be.
+
+    Raises:
+        TypeError: if ``path`` is no path or ``identity`` is not what JSON has.
+        ValueError: if the record says otherwise or is damaged.
+    """
+    path = check_path("path", path)
     given = json.loads(_json("identity", check_instance("identity", identity, dict)))
-    if not path.is_file() and _write_new(path, _json("identity", given).encode()):
-        return
-    found = read_json(path)
-    differing = _differing(found, given)
+    differing = _differing(read_json(path), given) if path.is_file() else []
     if differing:
         what = ", ".join(differing)
         raise ValueError(f"run folder {path.parent} holds another run, which differs in {what}: name another folder")

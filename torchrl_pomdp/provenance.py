@@ -11,8 +11,11 @@ from typing import Any
 
 import torch
 
-__all__ = ["provenance"]
+from torchrl_pomdp.files import DamagedFileError, read_json, write_json
 
+__all__ = ["known_provenance", "note_provenance", "provenance"]
+
+_FILE = "provenance.json"
 _PACKAGES = ("torchrl-pomdp", "torch", "torchrl", "tensordict")
 
 
@@ -34,6 +37,38 @@ def provenance(*packages: str) -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": {name: version(name) for name in (*_PACKAGES, *packages)},
     }
+
+
+def note_provenance(folder: Path) -> None:
+    """Add to a run folder's ``provenance.json`` what computes in it from now on, if it does not tell of that yet.
+
+    Args:
+        folder: the run folder.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     note_provenance(Path(folder))
+        ...     note_provenance(Path(folder))
+        ...     known_provenance(Path(folder)) == [provenance()]
+        True
+    """
+    known, own = known_provenance(folder), provenance()
+    if own not in known:
+        write_json(folder / _FILE, {"computed_by": [*known, own]})
+
+
+def known_provenance(folder: Path) -> list[dict[str, Any]]:
+    """What has computed in a run folder, in order; empty where that is not known.
+
+    Args:
+        folder: the run folder.
+    """
+    path = folder / _FILE
+    try:
+        return list(read_json(path)["computed_by"]) if path.is_file() else []
+    except (DamagedFileError, KeyError, TypeError):
+        return []
 
 
 def _commit() -> str | None:

@@ -30,7 +30,7 @@ from torchrl_pomdp.files import check_folder, write_bytes, write_json
 from torchrl_pomdp.problems import make_problem
 from torchrl_pomdp.problems.repair import REPAIR_PRESETS
 from torchrl_pomdp.progress import progress_bar
-from torchrl_pomdp.provenance import provenance
+from torchrl_pomdp.provenance import known_provenance
 from torchrl_pomdp.report import (
     Result,
     cost_figure,
@@ -275,6 +275,8 @@ def reproduce(
     device = check_device("device", device)
     runs, out = check_folder("runs", runs), check_folder("out", out)
     planned = plan(experiment, settings, base, scale, seed, problems, device)
+    for name, run in planned.items():
+        run.check(runs / name)
     out = out / experiment.name
     results: dict[str, dict[str, Comparison]] = {}
     iterations: dict[str, list[dict[str, Any]]] = {}
@@ -296,7 +298,8 @@ def reproduce(
         title = f"{title}-{'-'.join(problems)}"
     about = {"experiment": experiment.name, "settings": settings, "base": base, "scale": scale, "seed": seed}
     paired = {problem: paired_ratios(found) for problem, found in costs.items()}
-    text = _write(out, title, about, planned, results, iterations, paired)
+    provenances = {name: known_provenance(runs / name) for name in planned}
+    text = _write(out, title, about, planned, results, iterations, provenances, paired)
     tell(text)
     tell(draw(_figures(out, title, planned, results, iterations)))
     return text
@@ -309,12 +312,13 @@ def _write(
     planned: dict[str, TrainingRun],
     results: dict[str, dict[str, Comparison]],
     iterations: dict[str, list[dict[str, Any]]],
+    provenances: dict[str, list[dict[str, Any]]],
     paired: dict[str, dict[str, dict[str, Estimate | None]]],
 ) -> str:
     """Write numbers and tables; returns the tables."""
     content = {
         **about,
-        "provenance": provenance(),
+        "provenance": provenances,
         "runs": {name: run.to_dict() for name, run in planned.items()},
         "results": {name: {p: asdict(c) for p, c in found.items()} for name, found in results.items()},
         "paired": {

@@ -13,11 +13,13 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from _tiger import CONFIG, TWICE, assert_same, carried_out, tiger
 from torchrl.collectors.distributed import RayCollector
+from torchrl.record import CSVLogger
 
 from torchrl_pomdp import evaluation
 from torchrl_pomdp.collectors import PartSampler, RolloutImprovement, StateMemory, labels, memory
@@ -279,6 +281,17 @@ def test_a_worker_that_dies_again_and_again_is_given_up(cluster, monkeypatch):
     monkeypatch.setattr(ray_workers, "_RETRIES", 1)
     with RayWorkers() as workers, pytest.raises(WorkerError, match="number 7: WorkerCrashedError"):
         list(workers.tasks(dies, None, [7], lambda item: f"number {item}"))
+
+
+def test_logs_of_a_trained_part_are_closed(tmp_path):
+    """Else a long run ends at the system's limit of open files."""
+    logger = CSVLogger("log", log_dir=str(tmp_path))
+    rows = [("part/loss", 1.0, 50), ("part/loss", 0.5, 100)]
+    job = SimpleNamespace(part=0, name="part")
+    training = ray_workers.RayTraining(None, job, logger, lambda reference, name: ("trained", rows))
+    assert training.result() == "trained"
+    assert (tmp_path / "log/scalars/part/loss.csv").read_text().splitlines() == ["50,1.0", "100,0.5"]
+    assert not logger.experiment.files
 
 
 def test_what_was_released_does_nothing_more(cluster):

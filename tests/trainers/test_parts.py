@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torchrl.record import CSVLogger
@@ -53,6 +55,21 @@ def test_blocks_are_kept_in_memory_up_to_the_limit(problem, monkeypatch, tmp_pat
     assert [block.is_memmap() for block in rows] == [False, False, True, True]
     assert all(torch.equal(block["belief"], y["belief"]) for block in rows)
     assert len(data) == 256
+    data.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_states_that_do_not_fit_on_disk_are_refused(problem, monkeypatch, tmp_path):
+    """A mapped file without room would kill the process."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(parts, "MEMORY", 0)
+    monkeypatch.setattr(parts.shutil, "disk_usage", lambda folder: SimpleNamespace(free=2 << 20))
+    y = problem.training[0](torch.arange(10)).set("rest", torch.zeros(10, 40_000))
+    data = PartData(0, PartImages(problem.partition, problem.symmetries[:1]))
+    with pytest.raises(
+        OSError, match=r"labelled states need .* bytes more on disk, 2,097,152 are free; TMPDIR names another place"
+    ):
+        data.add(0, y)
     data.close()
     assert list(tmp_path.iterdir()) == []
 

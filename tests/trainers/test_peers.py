@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from dataclasses import replace
 
 import pytest
@@ -289,3 +290,28 @@ def test_ppo_comes_last(line3, tmp_path, monkeypatch):
     monkeypatch.setattr(peers, "ppo", lambda problem, **_: order.append("trained") or GreedyRepair(problem.model))
     compare_peers(line3, tmp_path, ppo_steps=5000, states=2, seconds=0.001, report=lambda name, _: order.append(name))
     assert order == ["greedy", "trained", "PPO"]
+
+
+@pytest.mark.parametrize("spoil", ["bit", "version"])
+def test_a_training_of_ppo_that_cannot_be_used_is_made_again(line3, tmp_path, monkeypatch, spoil):
+    """As all else in the folder; nobody could do more about it than delete it."""
+    monkeypatch.setattr(peers, "_peers", lambda problem, *_: {"greedy": peers._Peer(GreedyRepair(problem.model))})
+    options = {"ppo_steps": 4096, "seconds": 0.001, "states": 2}
+    first = compare_peers(line3, tmp_path, **options)["PPO"].costs
+    path = tmp_path / "ppo-4096.pt"
+    if spoil == "bit":
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+    else:
+        monkeypatch.setattr(sys.modules["torchrl_pomdp.trainers.ppo"], "__version__", "another")
+    assert compare_peers(line3, tmp_path, **options)["PPO"].costs == first
+
+
+def test_decisions_in_terminal_states_are_none(line3):
+    model = line3.model
+    y = line3.start(torch.arange(4))
+    y["belief"][:3] = torch.eye(model.num_levels)[0]
+    counted = peers._Counted(GreedyRepair(model), model)
+    counted(model.with_features(y))
+    assert counted.decisions == 1

@@ -447,3 +447,31 @@ def test_it_trains_where_gradients_are_switched_off(line3):
     (other,) = papi_nt(line3, config, base)
     for a, b in zip(one.policy.parameters(), other.policy.parameters(), strict=True):
         assert torch.equal(a, b)
+
+
+def test_agents_that_decide_in_turn_keep_their_order():
+    """Exchanged, a label would be of decisions that nobody has to make: the first robot's knows nothing of the second's."""
+    two = make_problem("two_robots20")
+    config = replace(TINY, multiagent=True)
+    assert len(PolicyIteration(two, TINY, GreedyRepair(two.model), [Improve((0,))])._images.symmetries) == 4
+    in_turn = PolicyIteration(two, config, GreedyRepair(two.model), [Improve((0,))])._images.symmetries
+    assert [each.robots.tolist() for each in in_turn] == [[0, 1], [0, 1]]
+    none = PolicyIteration(two, replace(config, symmetries=False), GreedyRepair(two.model), [Improve((0,))])
+    assert len(none._images.symmetries) == 1
+    # They do so in any case where nobody could list their joint controls.
+    many = make_problem("network32x8")
+    assert not many.model.enumerable
+    for multiagent in (False, True):
+        run = PolicyIteration(many, replace(TINY, multiagent=multiagent), GreedyRepair(many.model), [Improve((0,))])
+        assert len(run._images.symmetries) == len(many.symmetries)
+
+
+def test_labels_that_a_kill_has_left_behind_are_removed(line3, tmp_path):
+    folder = tmp_path / "run"
+    list(papi_nt(line3, TINY, GreedyRepair(line3.model), folder=folder))
+    (step, *_) = sorted(folder.glob("iteration-1/*.pt"))
+    left = step.with_suffix(".labels")
+    left.mkdir()
+    (left / "block.pt").write_bytes(b"labels")
+    list(papi_nt(line3, TINY, GreedyRepair(line3.model), folder=folder))
+    assert not left.exists()

@@ -59,9 +59,14 @@ def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
     figure = new_figure(1.4 * len(results) + 1.6, 3.6)
     axes = figure.add_subplot()
     means = [result.comparison.cost.mean for result in results]
-    names = [f"{result.name}\n{_beside(result.comparison)}" for result in results]
+    most = max(result.comparison.cost.count for result in results)
+    names = [f"{result.name}\n{_beside(result.comparison)}{_fewer(result.comparison, most)}" for result in results]
     errors = [half_width(result.comparison.cost) for result in results]
-    axes.bar(names, means, yerr=errors, capsize=5, color=["#9aa5b1"] + ["#3572a5"] * (len(results) - 1))
+    bars = axes.bar(names, means, yerr=errors, capsize=5, color=["#9aa5b1"] + ["#3572a5"] * (len(results) - 1))
+    for bar, result in zip(bars, results, strict=True):
+        if _fewer(result.comparison, most):
+            # Its height is not to be compared with the others'.
+            bar.set(hatch="//", edgecolor="white")
     axes.set_ylabel("discounted cost")
     # The baseline's own ratio is missing where all are.
     beside = "difference from" if results[0].comparison.ratio is None else "ratio to"
@@ -74,6 +79,11 @@ def cost_figure(results: Sequence[Result], title: str = "") -> Figure:
 def _beside(comparison: Comparison) -> str:
     """A policy against the baseline, in a word."""
     return f"{comparison.difference.mean:+.3g}" if comparison.ratio is None else ratio_texts(comparison.ratio)[0]
+
+
+def _fewer(comparison: Comparison, most: int) -> str:
+    """How many start states a policy was evaluated from, where these are fewer than others'."""
+    return f"\nfrom {comparison.cost.count} states" if comparison.cost.count < most else ""
 
 
 def iteration_figure(lines: Mapping[str, Sequence[Comparison]]) -> Figure:

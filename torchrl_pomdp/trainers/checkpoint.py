@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from torchrl_pomdp.checks import check_choice, check_instance, check_integer, check_label, check_path, check_text
 from torchrl_pomdp.config import PolicyIterationConfig
-from torchrl_pomdp.files import DamagedFileError, claim, load_tensors, parse_tensors, tensor_bytes, write_bytes
+from torchrl_pomdp.files import DamagedFileError, check_claim, claim, load_tensors, parse_tensors, tensor_bytes, write_bytes
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.modules import AgentNetwork, PartitionedPolicy, PartitionedValue, PolicyNetwork, ValueNetwork
 from torchrl_pomdp.problems.problem import Problem
@@ -32,6 +32,8 @@ from torchrl_pomdp.trainers.architecture import (
 
 __all__ = ["Checkpoint", "load_checkpoint", "open_run_folder", "problem_digest", "save_checkpoint"]
 
+# Whose folder it is, and every number of the run.
+_RECORD = "config.json"
 _FORMAT = "torchrl_pomdp policy 4"
 # What a checkpoint's JSON text holds.
 _ABOUT = {
@@ -100,13 +102,28 @@ def open_run_folder(path: str | PathLike[str], identity: dict[str, Any]) -> Path
         ...     open_run_folder(path, {"seed": 0}) == path
         True
     """
+    path = check_run_folder(path, identity)
+    claim(path / _RECORD, identity)
+    return path
+
+
+def check_run_folder(path: str | PathLike[str], identity: dict[str, Any]) -> Path:
+    """Raise as :func:`open_run_folder` would, but for a folder that cannot be written, and write nothing.
+
+    Args:
+        path: the folder.
+        identity: all that decides the run's results, as JSON.
+
+    Returns:
+        the folder.
+    """
     path = check_path("path", path)
-    record = path / "config.json"
+    record = path / _RECORD
     # What a kill in the middle of writing the record leaves has its name after a dot.
     in_use = path.exists() and (not path.is_dir() or any(not file.name.startswith(".config.") for file in path.iterdir()))
     if in_use and not record.is_file():
         raise ValueError(f"run folder {path} holds other files: name a folder that is empty, does not exist, or holds this run")
-    claim(record, identity)
+    check_claim(record, identity)
     return path
 
 

@@ -3,7 +3,9 @@ r"""Teaching the network of one part, under TorchRL's ``Trainer`` (paper, Sectio
 from __future__ import annotations
 
 import ctypes
+import errno
 import json
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -37,6 +39,8 @@ MEMORY = 2 << 30
 
 # Bytes that are written to disk before memory is given back.
 _GIVEN_BACK = 1 << 28
+# Room on disk beside what is mapped: files are longer than their numbers.
+_BESIDE = 1 << 20
 
 _LOG_INTERVAL = 50
 
@@ -136,22 +140,27 @@ class PartData:
     Args:
         part: the part.
         images: what becomes of the blocks.
+
+    Attributes:
+        bytes: how much there is.
     """
 
     def __init__(self, part: int, images: PartImages) -> None:
         self.part, self.images = part, images
         # By the part whose states were labelled and by symmetry, so that the order does not depend on the blocks.
         self._rows: dict[tuple[int, int], list[Any]] = {}
-        # Bytes so far, and those written since memory was last given back.
-        self._bytes = self._written = 0
+        self.bytes = 0
+        # Since memory was last given back.
+        self._written = 0
         self._folder: TemporaryDirectory[str] | None = None
 
     def add(self, source: int, block: TensorDictBase) -> None:
         """Add the images of a block of labelled states of part ``source`` that lie in the part."""
         for number, rows in enumerate(self.images.of_part(self.part, block)):
-            self._bytes += rows.bytes()
+            self.bytes += rows.bytes()
             if self.large and len(rows):
                 self._written += rows.bytes()
+                check_room(self.folder, rows.bytes())
                 rows = rows.cpu().memmap(self.folder / f"{source}-{number}-{len(self._rows.get((source, number), []))}")
             self._rows.setdefault((source, number), []).append(rows)
         if self._written > _GIVEN_BACK:
@@ -168,7 +177,7 @@ class PartData:
     @property
     def large(self) -> bool:
         """Whether there is more than memory is for."""
-        return self._bytes > MEMORY
+        return self.bytes > MEMORY
 
     @property
     def folder(self) -> Path:
@@ -182,6 +191,22 @@ class PartData:
         self._rows.clear()
         if self._folder is not None:
             self._folder.cleanup()
+
+
+def check_room(folder: Path, size: int) -> None:
+    """Raise unless so many bytes fit into a folder: a file that is mapped and finds no room kills the process.
+
+    Args:
+        folder: the folder.
+        size: number of bytes.
+
+    Raises:
+        OSError: if they do not fit.
+    """
+    free = shutil.disk_usage(folder).free
+    if size + _BESIDE > free:
+        what = f"labelled states need {size:,} bytes more on disk, {free:,} are free; TMPDIR names another place"
+        raise OSError(errno.ENOSPC, what, str(folder))
 
 
 def give_back() -> None:
@@ -289,6 +314,7 @@ def _filled(batch: TensorDictBase | PartData, size: int, seed: int) -> TensorDic
     blocks: list[Any] = [batch] if isinstance(batch, TensorDictBase) else list(batch)
     if isinstance(batch, PartData) and batch.large:
         device = torch.device("cpu")
+        check_room(batch.folder, batch.bytes)
         storage = LazyMemmapStorage(len(batch), scratch_dir=str(batch.folder / "buffer"), device=device)
     else:
         device = blocks[0].device or torch.device("cpu")

@@ -40,6 +40,7 @@ from torchrl_pomdp.checks import (
     check_sequence,
 )
 from torchrl_pomdp.config import EVALUATION_SEED, MAX_STATES
+from torchrl_pomdp.envs.belief_model import BeliefModel
 from torchrl_pomdp.evaluation import compare, discounted_costs
 from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
@@ -50,9 +51,10 @@ from torchrl_pomdp.modules.threads import kept_threads
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.planners import DESPOT, POMCP
 from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.provenance import note_provenance
 from torchrl_pomdp.report.peers import Outcome
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest
-from torchrl_pomdp.trainers.ppo import BATCH, ppo
+from torchrl_pomdp.trainers.ppo import BATCH, owner, ppo
 from torchrl_pomdp.trainers.recipes import r_t
 
 __all__ = ["compare_peers"]
@@ -148,10 +150,12 @@ def compare_peers(
     path = open_run_folder(check_path("folder", folder), found)
     execution = _Execution(problem, path, states, seed, progress)
     outcomes: dict[str, Outcome] = {}
+    trained = path / f"ppo-{ppo_steps}.pt"
+    if ppo_steps is not None and kept(trained, owner(problem, ppo_steps, seed)) is None:
+        # Like all else in the folder, it is made again where it is damaged or another version's.
+        trained.unlink(missing_ok=True)
     for name in dict.fromkeys(names):
-        peer = peers[name] or _Peer(
-            ppo(problem, steps=ppo_steps or 0, seed=seed, path=path / f"ppo-{ppo_steps}.pt", progress=progress)
-        )
+        peer = peers[name] or _Peer(execution.ppo(trained, ppo_steps or 0))
         outcomes[name] = execution.outcome(name, peer)
         report(name, outcomes[name])
     return outcomes
@@ -203,14 +207,14 @@ def _scenarios(seconds: float) -> int:
 
 
 class _Counted:
-    """A policy whose decisions are counted."""
+    """A policy whose decisions are counted, those in terminal states left out."""
 
-    def __init__(self, policy: Policy) -> None:
-        self.policy, self.decisions = policy, 0
+    def __init__(self, policy: Policy, model: BeliefModel) -> None:
+        self.policy, self.model, self.decisions = policy, model, 0
         self.in_keys = getattr(policy, "in_keys", ())
 
     def __call__(self, y: TensorDictBase) -> TensorDictBase:
-        self.decisions += y.batch_size.numel()
+        self.decisions += int((~self.model.is_terminal(y)).sum())
         return self.policy(y)
 
 
@@ -222,6 +226,13 @@ class _Execution:
     seed: int
     progress: bool
     _baseline: torch.Tensor | None = None
+    _noted: bool = False
+
+    def ppo(self, path: Path, steps: int) -> Policy:
+        """PPO, trained as far as its file does not have it already."""
+        if not path.is_file():
+            self._note()
+        return ppo(self.problem, steps=steps, seed=self.seed, path=path, progress=self.progress)
 
     def outcome(self, name: str, peer: _Peer) -> Outcome:
         """A method's costs, from the folder as far as they are there."""
@@ -241,13 +252,14 @@ class _Execution:
             path = self.folder / name / f"{first:07d}-{count}.pt"
             block = kept(path, f"{owner} {first}")
             if block is None:
+                self._note()
                 block = self._evaluate(f"{name}, from state {first}", model, peer.policy, first, count)
                 keep(path, f"{owner} {first}", block)
             yield block
 
-    def _evaluate(self, name: str, model: Any, policy: Policy, first: int, count: int) -> dict[str, Any]:
+    def _evaluate(self, name: str, model: BeliefModel, policy: Policy, first: int, count: int) -> dict[str, Any]:
         simulates = simulated_steps(policy) is not None
-        counted = _Counted(policy) if simulates else policy
+        counted = _Counted(policy, model) if simulates else policy
         before = simulated_steps(policy) or 0
         costs = discounted_costs(
             model,
@@ -262,6 +274,12 @@ class _Execution:
         )
         steps = (simulated_steps(policy) or 0) - before
         return {"costs": costs.cpu(), "decisions": counted.decisions if isinstance(counted, _Counted) else 0, "steps": steps}
+
+    def _note(self) -> None:
+        """Note in the folder what computes."""
+        if not self._noted:
+            note_provenance(self.folder)
+            self._noted = True
 
     def _time(self, name: str, policy: Policy, owner: str) -> float:
         """Median time of a decision in the first start states, taken once."""

@@ -25,11 +25,19 @@ from torchrl_pomdp.identity import digest
 from torchrl_pomdp.kept import keep, kept
 from torchrl_pomdp.modules import PartitionedPolicy, PartitionedValue, Policy
 from torchrl_pomdp.problems.problem import Problem
+from torchrl_pomdp.provenance import note_provenance
 from torchrl_pomdp.report.names import ALGORITHM_NAMES, is_own
 from torchrl_pomdp.report.run_folder import read_iterations
 from torchrl_pomdp.trainers.architecture import is_multiagent
 from torchrl_pomdp.trainers.asynchronous import AsynchronousIteration
-from torchrl_pomdp.trainers.checkpoint import Checkpoint, checkpoint_bytes, open_run_folder, problem_digest, save_checkpoint
+from torchrl_pomdp.trainers.checkpoint import (
+    Checkpoint,
+    check_run_folder,
+    checkpoint_bytes,
+    open_run_folder,
+    problem_digest,
+    save_checkpoint,
+)
 from torchrl_pomdp.trainers.plan import Improve
 from torchrl_pomdp.trainers.policy_iteration import Iteration
 from torchrl_pomdp.trainers.recipes import api, multiagent_rollouts, papi_nt, papi_t, r_nt, r_t
@@ -130,6 +138,11 @@ class TrainingRun:
             found[name] = content["costs"]
         return found
 
+    def check(self, folder: str | PathLike[str]) -> None:
+        """Raise ``TypeError`` or ``ValueError`` where :meth:`carry_out` would at once; nothing is written."""
+        check_run_folder(folder, _identity(self))
+        _check_kept(self)
+
     def carry_out(
         self,
         folder: str | PathLike[str],
@@ -169,7 +182,7 @@ class TrainingRun:
         if on_labels is not None:
             check_callable("on_labels", on_labels)
         check_instance("workers", workers, Workers).check_device(self.problem.model.device)
-        _check_kept(self)
+        self.check(folder)
         identity = _identity(self)
         path = open_run_folder(folder, identity)
         execution = _Execution(self, self.problem, path, identity, progress, report, on_labels, workers)
@@ -191,6 +204,7 @@ class _Execution:
     on_labels: OnLabels | None
     workers: Workers
     results: dict[str, Comparison] = field(default_factory=dict)
+    _noted: bool = False
 
     def carry_out(self) -> dict[str, Comparison]:
         run, bases = self.run, self.problem.base_policies
@@ -232,7 +246,7 @@ class _Execution:
             folder=self.folder,
             logger=CSVLogger("log", log_dir=str(self.folder)),
             progress=self.progress,
-            on_labels=self.on_labels,
+            on_labels=self._labelled,
             workers=self.workers,
         )
         training = together if run.staleness is None else AsynchronousIteration(together, run.staleness)
@@ -259,6 +273,19 @@ class _Execution:
                 write_json(self.folder / "iterations.json", summaries)
         self._keep("best.pt", kept_best)
         return best, training.best
+
+    def _labelled(self, labels: int, restored: bool) -> None:
+        """Pass on that states were labelled."""
+        if not restored:
+            self._note()
+        if self.on_labels is not None:
+            self.on_labels(labels, restored)
+
+    def _note(self) -> None:
+        """Note in the folder what computes; nothing where all was there already."""
+        if not self._noted:
+            note_provenance(self.folder)
+            self._noted = True
 
     def _known(self) -> int:
         """The number of iterations that the folder tells of."""
@@ -317,6 +344,7 @@ class _Execution:
         own, content = digest(policy), kept(path, owner)
         if content is not None and content["policy"] == own:
             return content["costs"]
+        self._note()
         costs = discounted_costs(
             self.problem.model,
             policy,
