@@ -304,10 +304,9 @@ def cheapest(q: Tensor) -> Tensor:
         return torch.zeros(q.shape[:-1], dtype=torch.int64, device=q.device)
     # For a single state the time of every operation counts.
     values = q.detach().cpu().numpy()
-    u = values.argmin(-1)
-    if not np.isfinite(values.min(-1)).all():
+    if not np.isfinite(np.minimum.reduce(values, -1)).all():
         raise ValueError("action_mask must allow at least one control in every state, got none")
-    return torch.as_tensor(u).to(q.device)
+    return torch.from_numpy(np.asarray(values.argmin(-1))).to(q.device)
 
 
 def spread(count: int) -> Tensor:
