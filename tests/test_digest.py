@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import NonTensorStack, TensorDict
 
 from torchrl_pomdp.collectors.states import PartSampler
 from torchrl_pomdp.envs.repair import CalibratedStart, grid, line
@@ -348,3 +348,8 @@ def test_attributes_of_partial_functions_count():
     one, other = functools.partial(default), functools.partial(default)
     other.rate = 2
     assert digest(one) == digest(functools.partial(default)) != digest(other)
+
+
+def test_what_is_no_tensor_and_differs_by_row_counts():
+    one, other, same = (TensorDict({"x": NonTensorStack("a", text)}, [2]) for text in ("b", "c", "b"))
+    assert digest(one) == digest(same) != digest(other)

@@ -76,3 +76,9 @@ def test_a_kill_without_links_leaves_a_record_that_is_damaged(tmp_path, monkeypa
             claim(path, {"seed": 0})
     with pytest.raises(DamagedFileError, match=f"{path} is damaged.*restore it or name another folder"):
         claim(path, {"seed": 0})
+
+
+def test_a_record_that_is_no_file_claims_nothing(tmp_path):
+    (tmp_path / "config.json").mkdir()
+    with pytest.raises(OSError, match=r"config\.json"):
+        claim(tmp_path / "config.json", {"seed": 0})

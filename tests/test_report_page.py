@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 from dataclasses import replace
@@ -285,3 +286,8 @@ def test_the_command_refuses_what_it_cannot_do(copied, tmp_path, capsys):
         (line,) = capsys.readouterr().err.splitlines()
         assert message in line
     assert not list(tmp_path.rglob("report.html"))
+
+
+def test_costs_that_differ_by_rounding_are_drawn():
+    costs = [("greedy", Estimate(19.3, 0.0, 9)), ("API 1", Estimate(math.nextafter(19.3, 20.0), 0.0, 9))]
+    assert iteration_chart(costs, {}).count("<circle") == 2

@@ -219,7 +219,7 @@ def claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
     path = check_path("path", path)
     text = _json("identity", check_instance("identity", identity, dict))
     if path.is_file() or not _write_new(path, text.encode()):
-        check_claim(path, identity)
+        _check_same(path, identity)
 
 
 def check_claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
@@ -234,8 +234,13 @@ def check_claim(path: str | PathLike[str], identity: dict[str, Any]) -> None:
         ValueError: if the record says otherwise or is damaged.
     """
     path = check_path("path", path)
-    given = json.loads(_json("identity", check_instance("identity", identity, dict)))
-    differing = _differing(read_json(path), given) if path.is_file() else []
+    check_instance("identity", identity, dict)
+    if path.is_file():
+        _check_same(path, identity)
+
+
+def _check_same(path: Path, identity: dict[str, Any]) -> None:
+    differing = _differing(read_json(path), json.loads(_json("identity", identity)))
     if differing:
         what = ", ".join(differing)
         raise ValueError(f"run folder {path.parent} holds another run, which differs in {what}: name another folder")

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase, is_leaf_nontensor
+from tensordict import TensorDictBase, is_leaf_nontensor, is_non_tensor
 from torch import Tensor, nn
 
 __all__ = ["digest", "identity"]
@@ -186,6 +186,8 @@ class _Graph:
     def _look(self, value: Any) -> _Content:
         if isinstance(value, Tensor):
             return _tensor(value)
+        if is_non_tensor(value):
+            return _content("no tensor", holds=[value.tolist()])
         if isinstance(value, TensorDictBase):
             keys = value.keys(include_nested=True, leaves_only=True, is_leaf=is_leaf_nontensor)
             leaves = {str(key): value.get(key) for key in keys}

@@ -40,7 +40,7 @@ def provenance(*packages: str) -> dict[str, Any]:
 
 
 def note_provenance(folder: Path) -> None:
-    """Add to a run folder's ``provenance.json`` what computes in it from now on, if it does not tell of that yet.
+    """Add to a run folder's ``provenance.json`` this process's commit and machine, if it does not tell of them yet.
 
     Args:
         folder: the run folder.
@@ -66,9 +66,10 @@ def known_provenance(folder: Path) -> list[dict[str, Any]]:
     """
     path = folder / _FILE
     try:
-        return list(read_json(path)["computed_by"]) if path.is_file() else []
-    except (DamagedFileError, KeyError, TypeError):
+        found: Any = read_json(path).get("computed_by") if path.is_file() else None
+    except DamagedFileError:
         return []
+    return list(found) if isinstance(found, list) and all(isinstance(each, dict) for each in found) else []
 
 
 def _commit() -> str | None:

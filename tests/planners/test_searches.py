@@ -452,3 +452,16 @@ def test_simulations_are_counted_inside_of_other_modules(make, line3):
     policy = PartitionedPolicy([search] * line3.partition.num_parts)
     policy(line3.model.with_features(line3.start(torch.arange(2))))
     assert simulated_steps(policy) == search.simulated_steps > 0
+
+
+def test_states_are_left_alone(make):
+    """Also beliefs in double precision, which no conversion copies."""
+    problem = make_problem("tiger")
+    given = problem.model
+    model = TabularModel(given.transition, given.observation, given.cost, given.discount, dtype=torch.float64)
+    first = torch.rand(64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    y = TensorDict({"belief": torch.stack([first, 1.0 - first], -1) * (1.0 + 1e-8)}, [64])
+    before, key = y["belief"].clone(), model.fingerprint(y)
+    make(model, None, simulations=2)(y)
+    assert torch.equal(y["belief"], before)
+    assert torch.equal(model.fingerprint(y), key)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,7 +11,7 @@ from torchrl_pomdp.envs import BeliefModel, FixedBelief, TabularModel
 from torchrl_pomdp.envs.repair import RandomState, RepairModel, damage_chain, line
 from torchrl_pomdp.envs.sums import sum_first
 from torchrl_pomdp.noise import uniform
-from torchrl_pomdp.problems import make_problem, tiger
+from torchrl_pomdp.problems import make_problem, rocksample, tiger
 from torchrl_pomdp.problems.check import check_belief_model
 
 END = 6
@@ -399,3 +401,25 @@ def test_large_costs_that_cancel_out_are_no_fault():
         return TensorDict({"belief": torch.stack([first + little, first, 1 - 2 * first - little], -1)}, keys.shape)
 
     check_belief_model(model, start)
+
+
+class Surcharge(TabularModel):
+    """A sampled step costs 2 more than is expected."""
+
+    def advance(self, y, u, noise):
+        cost, nxt = super().advance(y, u, noise)
+        return cost + 2.0, nxt
+
+
+def test_an_expensive_state_hides_no_fault_elsewhere():
+    """Such as one that stands for what is forbidden, and is never met."""
+    model = Surcharge(torch.eye(3).expand(1, 3, 3), torch.ones(1, 3, 1), [[1.0, 3.0, 1e6]], 0.9)
+    with pytest.raises(AssertionError, match="advance: its stage cost is expected_cost"):
+        check_belief_model(model, FixedBelief(torch.tensor([0.5, 0.5, 0.0])))
+
+
+@pytest.mark.parametrize("name", ["rocksample(5, 2)", "rocksample(40, 1)"])
+def test_probabilities_that_add_up_to_one_by_chance_are_no_distribution(name):
+    size, rocks = map(int, re.findall(r"\d+", name))
+    problem = rocksample(size, rocks)
+    check_belief_model(problem.model, problem.start)

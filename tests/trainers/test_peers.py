@@ -315,3 +315,12 @@ def test_decisions_in_terminal_states_are_none(line3):
     counted = peers._Counted(GreedyRepair(model), model)
     counted(model.with_features(y))
     assert counted.decisions == 1
+
+
+def test_a_training_of_ppo_that_is_not_asked_for_is_left_alone(line3, tmp_path, monkeypatch):
+    monkeypatch.setattr(peers, "_peers", lambda problem, *_: {"greedy": peers._Peer(GreedyRepair(problem.model))})
+    options = {"ppo_steps": 4096, "seconds": 0.001, "states": 2}
+    compare_peers(line3, tmp_path, methods=["greedy"], **options)
+    (tmp_path / "ppo-4096.pt").write_bytes(b"of another version")
+    compare_peers(line3, tmp_path, methods=["greedy"], **options)
+    assert (tmp_path / "ppo-4096.pt").read_bytes() == b"of another version"

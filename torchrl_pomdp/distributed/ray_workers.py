@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self
 
@@ -74,9 +77,11 @@ class RayWorkers(Workers):
         os.environ.setdefault("RAY_task_oom_retries", str(_RETRIES))
         try:
             if self._own and address is None:
-                ray.init("local", num_cpus=wanted, include_dashboard=False, log_to_driver=False, _node_ip_address=_LOOPBACK)
+                with _kept_sigterm():
+                    ray.init("local", num_cpus=wanted, include_dashboard=False, log_to_driver=False, _node_ip_address=_LOOPBACK)
             elif self._own and address is not None:
-                _connect(address)
+                with _kept_sigterm():
+                    _connect(address)
             self.num_workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
         except BaseException:
             self.close()
@@ -190,6 +195,15 @@ def _connect(address: str) -> None:
     except ConnectionError as error:
         token = "where the cluster has a token, set RAY_AUTH_MODE=token here too, and have the same ~/.ray/auth_token"
         raise ConnectionError(f"{error}; {token}") from error
+
+
+@contextmanager
+def _kept_sigterm() -> Iterator[None]:
+    """Leave a handler of SIGTERM in place that Ray would replace by one that exits."""
+    handler = signal.getsignal(signal.SIGTERM)
+    yield
+    if callable(handler) and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
 
 
 class RayTraining(Training):

@@ -17,12 +17,12 @@ from torchrl_pomdp.envs.rows import random_control
 from torchrl_pomdp.noise import fold, seed_keys
 from torchrl_pomdp.problems.check_laws import (
     MOST_ROWS,
+    CostSize,
     Outcomes,
     Pairs,
     check_advance,
     check_bayes,
     check_terminal,
-    cost_size,
     entries_of,
     legal_pairs,
     noise_of,
@@ -81,7 +81,7 @@ def check_belief_model(model: BeliefModel, generator: StateGenerator, *, seed: i
         _check_costs(probe, pairs)
         outcomes = _enumerated(probe, pairs)
         _check_batches(probe, pairs, outcomes)
-        size = cost_size(model, probe.cost(pairs.y, pairs.u))
+        size = CostSize(model, probe.cost(pairs.y, pairs.u))
         check_advance(probe, pairs, outcomes, size, seed)
         check_terminal(probe, terminal, size, seed)
         if outcomes is not None:

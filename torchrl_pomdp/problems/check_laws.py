@@ -16,12 +16,12 @@ from torchrl_pomdp.problems.probe import Probe, refuse, require, tolerance
 from torchrl_pomdp.tensor_checks import device_of
 
 __all__ = [
+    "CostSize",
     "Outcomes",
     "Pairs",
     "check_advance",
     "check_bayes",
     "check_terminal",
-    "cost_size",
     "entries_of",
     "legal_pairs",
     "noise_of",
@@ -100,15 +100,31 @@ def entries_of(y: TensorDictBase, keys: tuple[str, ...]) -> Tensor:
     return torch.cat([y.get(key).reshape(y.batch_size[0], -1).double() for key in keys], -1)
 
 
-def cost_size(model: BeliefModel, costs: Tensor) -> float:
-    """Size of stage costs, given expected ones, by which their rounding is measured; those of hidden states may cancel out."""
-    if isinstance(model, TabularModel):
-        hidden = model.cost.T[model.legal]
-        costs = torch.cat([costs.flatten(), hidden.to(costs)])
-    return float(costs.abs().max())
+class CostSize:
+    """Sizes of the numbers that expected costs are sums of, by which rounding of these is measured.
+
+    A tabular model's are known. Of others an expected cost is taken to be as large as what it is a sum of, or as a cost that is
+    not zero usually is.
+
+    Args:
+        model: the belief model.
+        costs: expected costs of many states and controls.
+    """
+
+    def __init__(self, model: BeliefModel, costs: Tensor) -> None:
+        self.model = model
+        spent = costs[costs != 0.0].abs()
+        self.usual = float(spent.median()) if len(spent) else model.max_cost or 1.0
+        self.largest = max(self.usual, float(costs.abs().max()))
+
+    def __call__(self, y: TensorDictBase, u: Tensor, cost: Tensor) -> Tensor:
+        """Of expected costs ``[N]`` of controls ``u`` in states ``y``: ``[N]``."""
+        if isinstance(self.model, TabularModel):
+            return (y.get("belief") * self.model.cost[u].abs()).sum(-1)
+        return cost.abs().clamp_min(self.usual)
 
 
-def check_advance(probe: Probe, pairs: Pairs, outcomes: Outcomes | None, size: float, seed: int) -> None:
+def check_advance(probe: Probe, pairs: Pairs, outcomes: Outcomes | None, size: CostSize, seed: int) -> None:
     """Raise unless sampled steps cost what they should and lead to the outcomes as often as they should."""
     model = probe.model
     keys = fold(seed_keys(seed, torch.arange(_SAMPLES, device=model.device)), -2)
@@ -120,12 +136,13 @@ def check_advance(probe: Probe, pairs: Pairs, outcomes: Outcomes | None, size: f
         row = torch.full((len(noise),), number, device=model.device)
         cost, nxt = probe.advance(pairs.y[row], pairs.u[row], noise)
         where = f"control {int(pairs.u[number])} in {_shown_state(pairs.y[number], model)}"
-        _check_stage_cost(cost, probe.cost(pairs.y[row], pairs.u[row]), size, where)
+        own = probe.cost(pairs.y[row], pairs.u[row])
+        _check_stage_cost(cost, own, size(pairs.y[row], pairs.u[row], own), where)
         if outcomes is not None:
             _check_frequencies(model, nxt, outcomes, outcomes.pair == number, where)
 
 
-def _check_stage_cost(cost: Tensor, own: Tensor, size: float, where: str) -> None:
+def _check_stage_cost(cost: Tensor, own: Tensor, size: Tensor, where: str) -> None:
     refuse(
         (cost - own).abs() > tolerance(own.dtype) * size,
         "advance",
@@ -169,7 +186,7 @@ def _check_frequencies(model: BeliefModel, nxt: TensorDictBase, outcomes: Outcom
     )
 
 
-def check_terminal(probe: Probe, y: TensorDictBase, size: float, seed: int) -> None:
+def check_terminal(probe: Probe, y: TensorDictBase, size: CostSize, seed: int) -> None:
     """Raise unless terminal states cost nothing, and lead to terminal states."""
     if y.batch_size[0] == 0:
         return
@@ -178,7 +195,7 @@ def check_terminal(probe: Probe, y: TensorDictBase, size: float, seed: int) -> N
     cost = probe.cost(pairs.y, pairs.u).abs()
     what = "No cost may follow a terminal state: let is_terminal be False there, or the cost 0."
     refuse(
-        cost > _SMALL_COST * size,
+        cost > _SMALL_COST * size.largest,
         "is_terminal",
         "terminal states cost nothing",
         lambda i: f"expected_cost {float(cost[i]):g} for control {int(pairs.u[i])} in {_shown_state(pairs.y[i], model)}",
@@ -204,7 +221,7 @@ def _shown_state(row: TensorDictBase, model: BeliefModel) -> str:
     return "state " + shown({key: row.get(key).tolist() for key in model.state_keys})
 
 
-def check_bayes(probe: Probe, pairs: Pairs, outcomes: Outcomes, size: float) -> None:
+def check_bayes(probe: Probe, pairs: Pairs, outcomes: Outcomes, size: CostSize) -> None:
     """Raise unless the model follows Bayes' rule, as far as that can be told."""
     _check_arrays(probe, pairs, outcomes)
     _check_linear(probe, pairs, size)
@@ -241,7 +258,7 @@ def _check_arrays(probe: Probe, pairs: Pairs, outcomes: Outcomes) -> None:
     )
 
 
-def _check_linear(probe: Probe, pairs: Pairs, size: float) -> None:
+def _check_linear(probe: Probe, pairs: Pairs, size: CostSize) -> None:
     """Raise unless costs and unnormalised posteriors are linear in the belief, where there is one to speak of."""
     model = probe.model
     floating = [key for key in model.state_keys if pairs.y.get(key).is_floating_point()]
@@ -266,12 +283,13 @@ def _check_linear(probe: Probe, pairs: Pairs, size: float) -> None:
         _check_mixed(probe, pairs.rows(first), pairs.rows(second), mixed, key, size)
 
 
-def _check_mixed(probe: Probe, first: Pairs, second: Pairs, mixed: Pairs, key: str, size: float) -> None:
+def _check_mixed(probe: Probe, first: Pairs, second: Pairs, mixed: Pairs, key: str, size: CostSize) -> None:
     limit = tolerance(probe.model.dtype)
     costs = [probe.cost(pairs.y, pairs.u) for pairs in (first, second, mixed)]
+    sizes = [size(pairs.y, pairs.u, cost) for pairs, cost in zip((first, second), costs[:2], strict=True)]
     off = (costs[2] - (costs[0] + costs[1]) / 2).abs()
     refuse(
-        off > limit * size,
+        off > limit * (sizes[0] + sizes[1]),
         "expected_cost",
         f"the expected cost is linear in {key!r}",
         lambda i: f"{float(costs[2][i]):g} half way between states of cost {float(costs[0][i]):g} and {float(costs[1][i]):g}",

@@ -16,6 +16,7 @@ from torchrl_pomdp.modules.rollout import TruncatedRollout
 from torchrl_pomdp.modules.scenarios import Scenarios
 from torchrl_pomdp.modules.terminal_costs import ZeroCost
 from torchrl_pomdp.noise import fold, seed_keys, uniform
+from torchrl_pomdp.problems.check_laws import CostSize
 from torchrl_pomdp.problems.probe import refuse, tolerance
 
 __all__ = ["check_engine", "check_environment"]
@@ -37,20 +38,23 @@ def _some_policy(model: BeliefModel, seed: int) -> Policy:
 Draw = Callable[[int, TensorDictBase, Tensor], Tensor]
 
 
-def _by_hand(model: BeliefModel, policy: Policy, y: TensorDictBase, draw: Draw) -> Tensor:
-    """Discounted costs ``[N]`` of some stages under given noise."""
+def _by_hand(model: BeliefModel, policy: Policy, y: TensorDictBase, draw: Draw, size: CostSize) -> tuple[Tensor, Tensor]:
+    """Discounted costs ``[N]`` of some stages under given noise, and the size of what they are sums of."""
     total = torch.zeros(y.batch_size, dtype=model.dtype, device=model.device)
+    sizes = torch.zeros_like(total)
     y = model.derive(y)
     ended = model.is_terminal(y)
     for stage in range(_COMPARED):
         u = policy(y.copy()).get("action")
-        cost, y = model.advance(y, u, draw(stage, y, u))
+        noise = draw(stage, y, u)
+        sizes = sizes + size(y, u, model.expected_cost(y, u))
+        cost, y = model.advance(y, u, noise)
         total = total + cost.masked_fill(ended, 0.0) * model.discount**stage
         ended = ended | model.is_terminal(y)
-    return total
+    return total, sizes
 
 
-def check_engine(model: BeliefModel, y: TensorDictBase, size: float, seed: int) -> None:
+def check_engine(model: BeliefModel, y: TensorDictBase, size: CostSize, seed: int) -> None:
     """Raise unless simulations cost what the steps of the model do."""
     keys = seed_keys(seed, torch.arange(y.batch_size[0], device=model.device))
     policy, scenarios = _some_policy(model, seed), Scenarios.single(keys)
@@ -60,12 +64,12 @@ def check_engine(model: BeliefModel, y: TensorDictBase, size: float, seed: int) 
         noise, scenarios = scenarios.draw(torch.full_like(u, stage), model.observed(y, u), 1)
         return noise
 
-    expected = _by_hand(model, policy, y, draw)
+    expected, sizes = _by_hand(model, policy, y, draw, size)
     cost = TruncatedRollout(model, policy, max_steps=_COMPARED, terminal_cost=ZeroCost())(y.clone(), keys)
-    _compare("TruncatedRollout", cost, expected, size)
+    _compare("TruncatedRollout", cost, expected, sizes)
 
 
-def check_environment(model: BeliefModel, generator: StateGenerator, y: TensorDictBase, size: float, seed: int) -> None:
+def check_environment(model: BeliefModel, generator: StateGenerator, y: TensorDictBase, size: CostSize, seed: int) -> None:
     """Raise unless the environment gives as reward what the steps of the model cost."""
     policy, batch = _some_policy(model, seed), y.batch_size
     env = BeliefEnv(model, generator, seed=seed % 2**62)
@@ -76,18 +80,18 @@ def check_environment(model: BeliefModel, generator: StateGenerator, y: TensorDi
     def draw(stage: int, y: TensorDictBase, u: Tensor) -> Tensor:
         return torch.rand(*batch, model.noise_dim, generator=rng, dtype=model.dtype, device=model.device)
 
-    expected = _by_hand(model, policy, y, draw)
+    expected, sizes = _by_hand(model, policy, y, draw, size)
     cost = torch.zeros_like(expected)
     for stage in range(_COMPARED):
         after = env.step(policy(now)).get("next")
         ended = now.get("terminated").squeeze(-1)
         cost = cost - after.get("reward").squeeze(-1).masked_fill(ended, 0.0) * model.discount**stage
         now = after.exclude("reward").set("terminated", after.get("terminated") | now.get("terminated"))
-    _compare("BeliefEnv", cost, expected, size)
+    _compare("BeliefEnv", cost, expected, sizes)
 
 
-def _compare(name: str, cost: Tensor, expected: Tensor, size: float) -> None:
-    limit = tolerance(cost.dtype) * _COMPARED * size
+def _compare(name: str, cost: Tensor, expected: Tensor, sizes: Tensor) -> None:
+    limit = tolerance(cost.dtype) * sizes
     refuse(
         (cost - expected).abs() > limit,
         name,

@@ -71,7 +71,8 @@ def iteration_chart(costs: Sequence[tuple[str, Estimate]], rejected: Mapping[str
 
 def _ticks(low: float, high: float) -> list[float]:
     """Four to nine round numbers around an interval."""
-    span = (high - low) or abs(high) or 1.0
+    # Costs that differ by rounding alone are one.
+    span = high - low if high - low > 1e-9 * max(abs(low), abs(high)) else abs(high) or 1.0
     step = 10.0 ** math.floor(math.log10(span / 4))
     step *= next(factor for factor in (1, 2, 5, 10) if span / (step * factor) <= 6)
     first, last = math.floor(low / step), max(math.ceil(high / step), math.floor(low / step) + 1)

@@ -196,6 +196,8 @@ class PartData:
 def check_room(folder: Path, size: int) -> None:
     """Raise unless so many bytes fit into a folder: a file that is mapped and finds no room kills the process.
 
+    What others write there at the same time, such as other parts, is not known.
+
     Args:
         folder: the folder.
         size: number of bytes.

@@ -150,12 +150,8 @@ def compare_peers(
     path = open_run_folder(check_path("folder", folder), found)
     execution = _Execution(problem, path, states, seed, progress)
     outcomes: dict[str, Outcome] = {}
-    trained = path / f"ppo-{ppo_steps}.pt"
-    if ppo_steps is not None and kept(trained, owner(problem, ppo_steps, seed)) is None:
-        # Like all else in the folder, it is made again where it is damaged or another version's.
-        trained.unlink(missing_ok=True)
     for name in dict.fromkeys(names):
-        peer = peers[name] or _Peer(execution.ppo(trained, ppo_steps or 0))
+        peer = peers[name] or _Peer(execution.ppo(ppo_steps or 0))
         outcomes[name] = execution.outcome(name, peer)
         report(name, outcomes[name])
     return outcomes
@@ -228,9 +224,14 @@ class _Execution:
     _baseline: torch.Tensor | None = None
     _noted: bool = False
 
-    def ppo(self, path: Path, steps: int) -> Policy:
+    def ppo(self, steps: int) -> Policy:
         """PPO, trained as far as its file does not have it already."""
-        if not path.is_file():
+        path = self.folder / f"ppo-{steps}.pt"
+        content = kept(path, owner(self.problem, steps, self.seed))
+        if content is None:
+            # Like all else in the folder, it is made again where it is damaged or another version's.
+            path.unlink(missing_ok=True)
+        if content is None or content["done"] < steps // BATCH:
             self._note()
         return ppo(self.problem, steps=steps, seed=self.seed, path=path, progress=self.progress)
 
@@ -286,6 +287,7 @@ class _Execution:
         path = self.folder / name / "time.pt"
         content = kept(path, owner)
         if content is None:
+            self._note()
             model = self.problem.model
             keys = seed_keys(self.seed, torch.arange(_TIMED + 1, device=model.device))
             y = model.derive(model.drawn(self.problem.start, fold(keys, 0)))

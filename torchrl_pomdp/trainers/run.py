@@ -90,7 +90,7 @@ class TrainingRun:
 
     online_states: int = 1000
     """Start states of the evaluation of online rollout on top of the trained policy, which takes longest: the first of the
-    ``states``, and no more; 0 for none."""
+    ``states``, and no more; 0 for none. Where the base policy is the best one, only if ``rollout_states`` are fewer."""
 
     online_trajectories: int = 10
     """Simulated trajectories of each control in online rollout."""
@@ -215,7 +215,7 @@ class _Execution:
             self._compare(f"{name} of {run.base}", online, run.rollout_states)
         best, policy = self._train(base)
         # On top of the base policy it is evaluated already.
-        if best != run.base or run.online_states > run.rollout_states:
+        if best != run.base or min(run.online_states, run.states) > run.rollout_states:
             # The first one: what the networks have been taught.
             name, online = next(iter(self._online(policy).items()))
             self._compare(f"{best} + {name}", online, run.online_states)
@@ -246,7 +246,7 @@ class _Execution:
             folder=self.folder,
             logger=CSVLogger("log", log_dir=str(self.folder)),
             progress=self.progress,
-            on_labels=self._labelled,
+            on_labels=self.on_labels,
             workers=self.workers,
         )
         training = together if run.staleness is None else AsynchronousIteration(together, run.staleness)
@@ -255,6 +255,8 @@ class _Execution:
             self._keep("best.pt", untrained)
         # What is known already, when a run is carried out again, does not become less meanwhile.
         summaries, known = [], self._known()
+        if not (self.folder / f"iteration-{run.config.iterations}.pt").is_file():
+            self._note()
         for iteration in training:
             name = f"{run.algorithm} {iteration.number}"
             checkpoint = Checkpoint(
@@ -273,13 +275,6 @@ class _Execution:
                 write_json(self.folder / "iterations.json", summaries)
         self._keep("best.pt", kept_best)
         return best, training.best
-
-    def _labelled(self, labels: int, restored: bool) -> None:
-        """Pass on that states were labelled."""
-        if not restored:
-            self._note()
-        if self.on_labels is not None:
-            self.on_labels(labels, restored)
 
     def _note(self) -> None:
         """Note in the folder what computes; nothing where all was there already."""

@@ -65,8 +65,8 @@ class TabularEngine(SearchEngine):
         """See :class:`SearchEngine`."""
         model = self.model
         beliefs = np.ascontiguousarray(y.get("belief").reshape(-1, model.num_states).double().numpy())
-        # Bounds of costs hold for distributions in double precision.
-        beliefs /= beliefs.sum(-1, keepdims=True)
+        # Bounds of costs hold for distributions in double precision; in a copy, as the caller's may be of that type.
+        beliefs = beliefs / beliefs.sum(-1, keepdims=True)
         keys = fold(model.fingerprint(y).reshape(-1), seed)
 
         def state(number: int) -> TabularHistory:
