@@ -294,6 +294,18 @@ def test_logs_of_a_trained_part_are_closed(tmp_path):
     assert not logger.experiment.files
 
 
+def test_rays_handler_of_sigterm_replaces_none_of_ours():
+    """It exits at once; the command's says that it goes on, and releases Ray."""
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with ray_workers._kept_sigterm():
+            signal.signal(signal.SIGTERM, lambda *args: sys.exit(15))
+        assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def test_what_was_released_does_nothing_more(cluster):
     """A call of Ray's would start a cluster again."""
     workers = RayWorkers()

@@ -366,6 +366,14 @@ def test_provenance_is_of_what_was_computed(tmp_path, monkeypatch):
     assert provenance.known_provenance(folder) == [{"commit": "first"}, {"commit": "third"}]
 
 
+@pytest.mark.parametrize("text", ["{}", "[]", "no JSON", '{"computed_by": 3}', '{"computed_by": {"a": 1}}'])
+def test_provenance_that_tells_nothing_is_none(tmp_path, text):
+    (tmp_path / "provenance.json").write_text(text)
+    assert provenance.known_provenance(tmp_path) == []
+    provenance.note_provenance(tmp_path)
+    assert provenance.known_provenance(tmp_path) == [provenance.provenance()]
+
+
 def test_online_rollout_of_the_base_policy_is_evaluated_once(tmp_path):
     config = replace(TINY, validation_states=200)
     found = replace(RUN, base="urgency", config=config, states=20, rollout_states=20, online_states=20).carry_out(
