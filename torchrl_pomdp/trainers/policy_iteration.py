@@ -170,12 +170,12 @@ class PolicyIteration:
 
     def _symmetries(self) -> list[Symmetry]:
         """Those whose images are labelled states, too."""
-        identity, *others = self.problem.symmetries
+        itself, *others = self.problem.symmetries
         if not self.config.symmetries:
-            return [identity]
+            return [itself]
         # Agents that decide in turn cannot change places.
         in_turn = self._multiagent and self.problem.model.num_agents > 1
-        return [identity, *(each for each in others if not in_turn or getattr(each, "keeps_order", False))]
+        return [itself, *(each for each in others if not in_turn or getattr(each, "keeps_order", False))]
 
     def _shared_encoder(self) -> Encoder:
         """What the policy networks share, the base policy's own too."""
