@@ -11,11 +11,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -252,22 +252,18 @@ def main(args: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     logger.setLevel("WARNING")
+    actions: dict[type, Callable[[Any], None]] = {
+        Train: commands.train,
+        Evaluate: commands.evaluate,
+        Compare: commands.compare,
+        Changes: commands.changes,
+        Reproduce: commands.reproduce,
+        Report: commands.report,
+        Problems: lambda command: commands.problems(),
+    }
     try:
         with _interrupted_by_sigterm():
-            if isinstance(command, Train):
-                commands.train(command)
-            elif isinstance(command, Evaluate):
-                commands.evaluate(command)
-            elif isinstance(command, Compare):
-                commands.compare(command)
-            elif isinstance(command, Changes):
-                commands.changes(command)
-            elif isinstance(command, Reproduce):
-                commands.reproduce(command)
-            elif isinstance(command, Report):
-                commands.report(command)
-            else:
-                commands.problems()
+            actions[type(command)](command)
             sys.stdout.flush()
     except BrokenPipeError:
         # As by `| head`. What is left to write goes nowhere, so that the interpreter need not complain about it at its end.

@@ -194,7 +194,7 @@ def test_encoders_of_equal_size_are_told_apart(line3, path):
     "change",
     [
         {"problem": "line3"}, {"config": {}}, {"algorithm": 3}, {"algorithm": "\x1b[31mred"}, {"algorithm": ""},
-        {"algorithm": "/tmp/x"}, {"algorithm": "../x"}, {"algorithm": "x" * 101},
+        {"algorithm": "/x"}, {"algorithm": "../x"}, {"algorithm": "x" * 101},
         {"iteration": -1}, {"iteration": 1.0}, {"iteration": "x"}, {"iteration": True}, {"policy": None}, {"value": None},
     ],
 )  # fmt: skip

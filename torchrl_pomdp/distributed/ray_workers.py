@@ -76,11 +76,10 @@ class RayWorkers(Workers):
         # Otherwise a task that needs too much memory is begun again without end.
         os.environ.setdefault("RAY_task_oom_retries", str(_RETRIES))
         try:
-            if self._own and address is None:
-                with _kept_sigterm():
+            with _kept_sigterm():
+                if self._own and address is None:
                     ray.init("local", num_cpus=wanted, include_dashboard=False, log_to_driver=False, _node_ip_address=_LOOPBACK)
-            elif self._own and address is not None:
-                with _kept_sigterm():
+                elif self._own and address is not None:
                     _connect(address)
             self.num_workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
         except BaseException:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from os import PathLike
 from pathlib import Path
 from statistics import median
@@ -54,7 +55,7 @@ from torchrl_pomdp.problems.problem import Problem
 from torchrl_pomdp.provenance import note_provenance
 from torchrl_pomdp.report.peers import Outcome
 from torchrl_pomdp.trainers.checkpoint import Checkpoint, open_run_folder, problem_digest
-from torchrl_pomdp.trainers.ppo import BATCH, owner, ppo
+from torchrl_pomdp.trainers.ppo import BATCH, ppo, training_owner
 from torchrl_pomdp.trainers.recipes import r_t
 
 __all__ = ["compare_peers"]
@@ -222,16 +223,19 @@ class _Execution:
     seed: int
     progress: bool
     _baseline: torch.Tensor | None = None
-    _noted: bool = False
+
+    def __post_init__(self) -> None:
+        # What computes is noted once; not at all where everything was there already.
+        self._note = cache(partial(note_provenance, self.folder))
 
     def ppo(self, steps: int) -> Policy:
         """PPO, trained as far as its file does not have it already."""
-        path = self.folder / f"ppo-{steps}.pt"
-        content = kept(path, owner(self.problem, steps, self.seed))
+        path, batches = self.folder / f"ppo-{steps}.pt", steps // BATCH
+        content = kept(path, training_owner(self.problem, batches, self.seed))
         if content is None:
             # Like all else in the folder, it is made again where it is damaged or another version's.
             path.unlink(missing_ok=True)
-        if content is None or content["done"] < steps // BATCH:
+        if content is None or content["done"] < batches:
             self._note()
         return ppo(self.problem, steps=steps, seed=self.seed, path=path, progress=self.progress)
 
@@ -275,12 +279,6 @@ class _Execution:
         )
         steps = (simulated_steps(policy) or 0) - before
         return {"costs": costs.cpu(), "decisions": counted.decisions if isinstance(counted, _Counted) else 0, "steps": steps}
-
-    def _note(self) -> None:
-        """Note in the folder what computes."""
-        if not self._noted:
-            note_provenance(self.folder)
-            self._noted = True
 
     def _time(self, name: str, policy: Policy, owner: str) -> float:
         """Median time of a decision in the first start states, taken once."""

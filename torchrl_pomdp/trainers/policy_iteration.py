@@ -261,8 +261,10 @@ class PolicyIteration:
     def _restore(self, networks: dict[int, LocalNetwork], name: str) -> dict[str, PartRecord] | None:
         """Load the networks of a step where an interrupted run has trained them; None where it has not."""
         path = self._path(name)
-        content = None if path is None else kept(path, f"{self._owner} {name}", self.problem.model.device)
-        if path is None or content is None:
+        if path is None:
+            return None
+        content = kept(path, f"{self._owner} {name}", self.problem.model.device)
+        if content is None:
             return None
         # A kill may have come before they were removed.
         shutil.rmtree(path.with_suffix(".labels"), ignore_errors=True)

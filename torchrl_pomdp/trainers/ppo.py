@@ -116,7 +116,7 @@ def ppo(
     steps, seed = check_integer("steps", steps, size, _MOST), check_seed("seed", seed)
     check_flag("progress", progress)
     batches = steps // size
-    file = None if path is None else _File(path, owner(problem, steps, seed, episodes))
+    file = None if path is None else _File(path, training_owner(problem, batches, seed, episodes))
     training = Training(problem, batches, seed, episodes)
     if file is not None and file.content is not None:
         training.load_state_dict(file.content)
@@ -132,9 +132,8 @@ def ppo(
     return training.policy.eval()
 
 
-def owner(problem: Problem, steps: int, seed: int, episodes: int = _EPISODES) -> str:
-    """Digest of all that decides a training, see :func:`ppo`: its file belongs to it alone."""
-    batches = steps // (episodes * _STAGES)
+def training_owner(problem: Problem, batches: int, seed: int, episodes: int = _EPISODES) -> str:
+    """Digest of all that decides a training of so many updates, see :func:`ppo`: its file belongs to it alone."""
     return digest([__version__, problem_digest(problem.unpartitioned()), batches, seed, episodes])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -182,7 +182,7 @@ class TrainingRun:
         if on_labels is not None:
             check_callable("on_labels", on_labels)
         check_instance("workers", workers, Workers).check_device(self.problem.model.device)
-        self.check(folder)
+        _check_kept(self)
         identity = _identity(self)
         path = open_run_folder(folder, identity)
         execution = _Execution(self, self.problem, path, identity, progress, report, on_labels, workers)
@@ -204,7 +204,10 @@ class _Execution:
     on_labels: OnLabels | None
     workers: Workers
     results: dict[str, Comparison] = field(default_factory=dict)
-    _noted: bool = False
+
+    def __post_init__(self) -> None:
+        # What computes is noted once; not at all where everything was there already.
+        self._note = cache(partial(note_provenance, self.folder))
 
     def carry_out(self) -> dict[str, Comparison]:
         run, bases = self.run, self.problem.base_policies
@@ -275,12 +278,6 @@ class _Execution:
                 write_json(self.folder / "iterations.json", summaries)
         self._keep("best.pt", kept_best)
         return best, training.best
-
-    def _note(self) -> None:
-        """Note in the folder what computes; nothing where all was there already."""
-        if not self._noted:
-            note_provenance(self.folder)
-            self._noted = True
 
     def _known(self) -> int:
         """The number of iterations that the folder tells of."""
